@@ -36,7 +36,7 @@ VARIED = {
     ),
     "window": ("sigma",),
     "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
-    "statistics": ("freedom", "least_variance", "own"),
+    "statistics": ("freedom", "least_variance", "independent_fraction"),
 }
 """Constants of each part of the method."""
 QUICK = ("least_variance", "sigma")

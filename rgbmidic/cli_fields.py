@@ -165,7 +165,7 @@ def profile(
                 f"note: at {wave.arrivals.cut.sum()} of {len(wave.arrivals.cut)} positions the field still rises in "
                 "the last frames: its peak is not known, they are left out; --level takes a value, too, such as -0.005"
             )
-        if not wave.front.straight:
+        if not wave.front.is_straight:
             command.note(
                 "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "
                 "form, or the mesh does not follow it; the uncertainty of the speed includes that scatter"

@@ -18,7 +18,7 @@ import real_files
 import scipy.sparse as sp
 
 from rgbmidic import Tri3Mesh, measure
-from rgbmidic.fields import Nodal, NodalCovariance, Places, at_nodes, at_pixels
+from rgbmidic.fields import MeshPoints, Nodal, NodalCovariance, at_nodes, at_pixels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES
@@ -119,7 +119,7 @@ def compared(mesh: Tri3Mesh, nodal: Nodal, truth: FloatArray) -> Iterator[tuple[
 
     def errors(points: FloatArray, factors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Errors, uncertainties and true values (T, 2, S) of sums, with factors (P,), over points (S, P, 2)."""
-        at = Places.of(mesh, points).weights(has_data)
+        at = MeshPoints.of(mesh, points).weights(has_data)
         weights = (sp.kron(sp.eye(len(points)), factors, format="csr") @ at).toarray()
         exact = np.stack([at_nodes(frame, points.reshape(-1, 2)) for frame in truth])
         exact = np.einsum("tspc,p->tcs", exact.reshape(len(truth), *points.shape), factors)

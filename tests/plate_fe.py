@@ -14,7 +14,7 @@ from scipy.sparse.linalg import spsolve
 from textures import Texture
 
 from rgbmidic import correlate
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.comparison import Comparison, FrameComparison
@@ -112,7 +112,7 @@ class Plate:
         spatial = np.stack([x.ravel(), y.ravel()], axis=1)
         drawn, material = Tri3Mesh(nodes=self.nodes, elements=self.mesh.elements), spatial
         for _ in range(3 if amount else 0):  # the strain is 1e-2: each step gains two digits
-            places = Places.of(drawn, material)
+            places = MeshPoints.of(drawn, material)
             values = amount * self.moved[drawn.elements[places.element]]
             material = spatial - np.einsum("pc,pcd->pd", places.barycentric, values)
         return texture.at(*material.T).reshape(SHAPE)

@@ -3,13 +3,14 @@
 from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
-from rgbmidic.fields.interpolation import Places, at_nodes, at_pixels, field_rms
+from rgbmidic.fields.interpolation import MeshPoints, at_nodes, at_pixels, field_rms
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, difference_std, frame_covariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
 from rgbmidic.fields.units import Units
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.text import format_value, format_with_std
 
 __all__ = [
@@ -20,9 +21,9 @@ __all__ = [
     "History",
     "Jump",
     "Mean",
+    "MeshPoints",
     "Nodal",
     "NodalCovariance",
-    "Places",
     "Probe",
     "ProfileLine",
     "Rates",
@@ -50,3 +51,5 @@ __all__ = [
     "strain_of_gradient",
     "stress_intensity",
 ]
+
+__getattr__ = refuse_old_names(__name__)

@@ -21,9 +21,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import InputError
-from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
-from rgbmidic.fields.history import History, Nodal, Part, histories_of
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.cracks import comma_separated, crack_faces, nearest_node, select_nodes
+from rgbmidic.fields.history import History, Nodal, ProbeQuantity, histories_of
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
@@ -79,7 +79,7 @@ _CONSTANTS = CrackTipConstants()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Williams:
-    """What the fit of Williams' series needs beside the displacements.
+    """Material, scale and terms that the fit of Williams' series needs beside the displacements.
 
     Attributes
     ----------
@@ -213,7 +213,7 @@ class CrackTip:
         1 for a node on the left side of the crack, -1 on its right side, else 0.
     correlation : ndarray, shape (m, m)
         Of the nodes' errors.
-    least
+    min_nodes
         Least number of nodes for the terms that are asked for.
     most_terms
         Highest term that is taken, stated or allowed to the test.
@@ -228,9 +228,9 @@ class CrackTip:
     def __init__(self, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> None:
         mesh, (inner, outer) = covariance.mesh, place[2:]
         self.name, self.williams, self.radii = name, williams, (float(inner), float(outer))
-        faces, places = crack_faces(mesh), mesh.merged_index
-        alone = np.setdiff1d(faces, mesh.copies)
-        node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
+        faces, merged_index = crack_faces(mesh), mesh.merged_index
+        tip_nodes = np.setdiff1d(faces, mesh.copies)
+        node = nearest_node(mesh, name, tip_nodes, np.array(place[:2]), "the tip of a crack")
         self.tip = tip = mesh.nodes[node]
         nearest = _CONSTANTS.inner * mesh.size
         if not nearest <= inner < outer:
@@ -238,7 +238,7 @@ class CrackTip:
                 f"{name} needs an inner radius of 2 elements, {nearest:.3g} px, or more, as nearer nodes do not "
                 f"resolve the field at a tip, and a larger outer one; given are {inner:g} and {outer:g} px"
             )
-        near = np.setdiff1d(places[faces], node)
+        near = np.setdiff1d(merged_index[faces], node)
         behind = tip - mesh.nodes[near]
         behind = behind[np.hypot(*behind.T) < outer]
         ahead = behind.sum(axis=0) / np.hypot(*behind.sum(axis=0))
@@ -246,19 +246,21 @@ class CrackTip:
         along, beside = self.axes @ behind.T
         if np.abs(beside).max() > _CONSTANTS.straight or along.min() < 0 or along.max() < outer - 2 * mesh.size:
             raise InputError(
-                f"{name} needs one crack that is straight from the tip at ({listed(tip.round(1))}) px to the outer "
-                f"radius, {outer:g} px; it is {along.max():.4g} px long there and leaves its line by "
+                f"{name} needs one crack that is straight from the tip at ({comma_separated(tip.round(1))}) px to the "
+                f"outer radius, {outer:g} px; it is {along.max():.4g} px long there and leaves its line by "
                 f"{np.abs(beside).max():.3g} px"
             )
         side = np.zeros(len(mesh.nodes))
         forward = (mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]) @ ahead > 0
         side[faces[forward]], side[faces[~forward]] = -1, 1
-        away = np.hypot(*(mesh.nodes - tip).T)
-        self.nodes = np.flatnonzero((away >= inner) & (away <= outer))
+        distance = np.hypot(*(mesh.nodes - tip).T)
+        self.nodes = np.flatnonzero((distance >= inner) & (distance <= outer))
         self.points, self.face = (mesh.nodes[self.nodes] - tip) @ self.axes.T, side[self.nodes]
-        part, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
-        self.correlations = np.stack([(root @ root.T).toarray() for root in (part.fit, part.bias)])
-        self.least = per * ((williams.terms or 2) + 1)
+        node_covariance, per = covariance.subset(self.nodes), _CONSTANTS.per_coefficient
+        self.correlations = np.stack(
+            [(root @ root.T).toarray() for root in (node_covariance.fit, node_covariance.bias)]
+        )
+        self.min_nodes = per * ((williams.terms or 2) + 1)
         self.most_terms = williams.terms or min(_CONSTANTS.most_terms, len(self.nodes) // per - 1)
         self._check_annulus(mesh)
 
@@ -266,17 +268,20 @@ class CrackTip:
         inner, outer = self.radii
         angles, radii = np.linspace(0, 2 * np.pi, 90, endpoint=False), np.linspace(inner, outer, 40)
         ring = self.tip + radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        outside = 1 - Places.of(mesh, ring.reshape(-1, 2)).inside.reshape(ring.shape[:2]).mean(axis=1)
-        where = f"{self.name}: the annulus from {inner:g} to {outer:g} px around ({listed(self.tip.round(1))}) px"
+        outside = 1 - MeshPoints.of(mesh, ring.reshape(-1, 2)).inside.reshape(ring.shape[:2]).mean(axis=1)
+        annulus_text = (
+            f"{self.name}: the annulus from {inner:g} to {outer:g} px around ({comma_separated(self.tip.round(1))}) px"
+        )
         if len(cut := np.flatnonzero(outside > _CONSTANTS.outside)):
-            most = f"it may reach to {radii[cut[0] - 1]:.4g} px" if cut[0] else "no part of it is within"
+            reach_text = f"it may reach to {radii[cut[0] - 1]:.4g} px" if cut[0] else "no part of it is within"
             raise InputError(
-                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; {most}"
+                f"{annulus_text} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; "
+                f"{reach_text}"
             )
-        if not self._enough(np.ones(len(self.nodes), dtype=bool)):
+        if not self._is_sufficient(np.ones(len(self.nodes), dtype=bool)):
             raise InputError(
-                f"{where} has {len(self.nodes)} nodes, none over up to {self._gap(self.points):.0f} degrees; "
-                f"{self.least} are needed, and one every {_CONSTANTS.gap_deg:g} degrees: widen it, or take smaller "
+                f"{annulus_text} has {len(self.nodes)} nodes, none over up to {self._gap(self.points):.0f} degrees; "
+                f"{self.min_nodes} are needed, and one every {_CONSTANTS.gap_deg:g} degrees: widen it, or take smaller "
                 "elements"
             )
 
@@ -290,8 +295,8 @@ class CrackTip:
         """Largest angle in degrees without a point, the crack's two sides being ends."""
         return float(np.degrees(np.diff(np.sort([-np.pi, *np.arctan2(points[:, 1], points[:, 0]), np.pi])).max()))
 
-    def _enough(self, known: BoolArray) -> bool:
-        return bool(known.sum() >= self.least and self._gap(self.points[known]) <= _CONSTANTS.gap_deg)
+    def _is_sufficient(self, is_measured: BoolArray) -> bool:
+        return bool(is_measured.sum() >= self.min_nodes and self._gap(self.points[is_measured]) <= _CONSTANTS.gap_deg)
 
     def read(self, nodal: Nodal) -> StressIntensity:
         """Fit the series to the displacements of the `nodes` in every frame.
@@ -302,32 +307,34 @@ class CrackTip:
         thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
         """
         fields = nodal.fields.swapaxes(0, 1)
-        known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
-        frames = np.flatnonzero([self._enough(row) for row in known])
-        data = {frame: _Weighted(self, fields[frame], known[frame]) for frame in frames.tolist()}
+        is_measured: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
+        frames = np.flatnonzero([self._is_sufficient(row) for row in is_measured])
+        data = {frame: _Weighted(self, fields[frame], is_measured[frame]) for frame in frames.tolist()}
         fit_tip = self.williams.fit_tip
-        terms = self.williams.terms or self._terms([one for one in data.values() if not one.certain])
-        found, chi_square = np.full((len(fields), 4, 2), np.nan), np.full(len(fields), np.nan)
+        terms = self.williams.terms or self._terms(
+            [frame_data for frame_data in data.values() if not frame_data.certain]
+        )
+        coefficients, chi_square = np.full((len(fields), 4, 2), np.nan), np.full(len(fields), np.nan)
         for frame, weighted in data.items():
             if (fit := weighted.fit(terms)) is not None:
                 values, covariance, chi_square[frame] = fit
                 std = np.sqrt(np.diag(covariance) * max(1.0, chi_square[frame]))
                 if weighted.certain:
                     std, chi_square[frame] = 0 * std, np.nan
-                found[frame] = np.stack([values, std], axis=1)[[2, 3, 4, -1]]
+                coefficients[frame] = np.stack([values, std], axis=1)[[2, 3, 4, -1]]
         outer, units, scale = self.radii[1], self.williams.units, self.williams.shear
         assert units.mm_per_pixel is not None
         # coefficients are those of (r / outer)^(n/2); a pixel is mm_per_pixel / 1000 m
-        factors = scale * np.sqrt(2 * np.pi * units.mm_per_pixel * 1e-3 / outer) * found[:, :2]
+        factors = scale * np.sqrt(2 * np.pi * units.mm_per_pixel * 1e-3 / outer) * coefficients[:, :2]
         factors[..., 1] = np.hypot(factors[..., 1], factors[..., 0] * units.mm_per_pixel_std / units.mm_per_pixel / 2)
-        t_stress = 4 * scale / outer * found[:, 2]
+        t_stress = 4 * scale / outer * coefficients[:, 2]
         return StressIntensity(
             factors=factors[..., 0],
             factors_std=factors[..., 1],
             t_stress=t_stress[:, 0],
             t_stress_std=t_stress[:, 1],
-            extension=found[:, 3, 0] if fit_tip else None,
-            extension_std=found[:, 3, 1] if fit_tip else None,
+            extension=coefficients[:, 3, 0] if fit_tip else None,
+            extension_std=coefficients[:, 3, 1] if fit_tip else None,
             chi_square=chi_square,
             terms=terms,
         )
@@ -336,39 +343,40 @@ class CrackTip:
         """Choose the highest term of the series."""
         from scipy.stats import chi2
 
-        most = self.most_terms
-        orders = range(-1 if self.williams.fit_tip else 0, most + 1)
+        most_terms = self.most_terms
+        orders = range(-1 if self.williams.fit_tip else 0, most_terms + 1)
         misfits = np.array([frame.misfits(orders) for frame in frames]).reshape(-1, len(orders))
         freedom = np.array([2 * len(frame.points) - 2 * len(orders) for frame in frames])
         level = np.maximum(1, misfits[:, -1] / freedom)
-        for terms in range(2, most):
-            limit = chi2.isf(_CONSTANTS.chance / max(len(frames), 1), 2 * (most - terms))
-            if (misfits[:, terms - most - 1] - misfits[:, -1] < limit * level).all():
+        for terms in range(2, most_terms):
+            limit = chi2.isf(_CONSTANTS.chance / max(len(frames), 1), 2 * (most_terms - terms))
+            if (misfits[:, terms - most_terms - 1] - misfits[:, -1] < limit * level).all():
                 return terms
-        return most
+        return most_terms
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the stress intensity factors, the T-stress, the fitted tip's way and the chi-square of the fit."""
         s, w = self.read(nodal), self.williams
-        tip = "its place along the crack is fitted" if w.fit_tip else "its place is that of the mesh"
+        tip, radii = comma_separated(self.tip.round(1)), comma_separated(self.radii)
+        tip_text = "its place along the crack is fitted" if w.fit_tip else "its place is that of the mesh"
         note = (
-            f"{self.name}: tip at ({listed(self.tip.round(1))}) px, {tip}; Williams' series up to n = {s.terms} "
-            f"({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes at {listed(self.radii)} px, plane "
-            f"{w.plane}, E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
+            f"{self.name}: tip at ({tip}) px, {tip_text}; Williams' series up to n = "
+            f"{s.terms} ({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes at {radii} px, "
+            f"plane {w.plane}, E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
         )
         if np.isfinite(s.chi_square).any() and (worst := np.nanmax(s.chi_square)) > _CONSTANTS.poor:
             note += (
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
             )
-        parts: list[Part] = [
+        quantities: list[ProbeQuantity] = [
             ("K1", "MPa √m", s.factors[:, 0], s.factors_std[:, 0]),
             ("K2", "MPa √m", s.factors[:, 1], s.factors_std[:, 1]),
             ("T", "MPa", s.t_stress, s.t_stress_std),
         ]
         if s.extension is not None:
-            parts.append(("extension", "px", s.extension, s.extension_std))
-        return histories_of(self.name, [*parts, ("chi_square", "", s.chi_square, None)], note)
+            quantities.append(("extension", "px", s.extension, s.extension_std))
+        return histories_of(self.name, [*quantities, ("chi_square", "", s.chi_square, None)], note)
 
 
 class _Weighted:
@@ -386,35 +394,35 @@ class _Weighted:
         Whether the displacements are stated without uncertainty, as those of the reference: all errors are then 1 px.
     """
 
-    def __init__(self, probe: CrackTip, field: FloatArray, known: BoolArray) -> None:
-        std, bias = field[2:4, known], field[4:, known]
+    def __init__(self, probe: CrackTip, field: FloatArray, is_measured: BoolArray) -> None:
+        std, bias = field[2:4, is_measured], field[4:, is_measured]
         level = float(np.median(std))
         self.probe, self.certain, self._factors = probe, not level > 0, list[FloatArray]()
         std = np.ones_like(std) if self.certain else np.maximum(std, _CONSTANTS.least_std * level)
-        correlations, shared = probe.correlations[:, known][..., known], np.minimum(bias, std)
-        for parts in np.stack([np.sqrt(std**2 - shared**2), shared], axis=1)[..., None]:
-            covariance = (parts * correlations * parts.swapaxes(1, 2)).sum(axis=0)
+        correlations, shared = probe.correlations[:, is_measured][..., is_measured], np.minimum(bias, std)
+        for component_std in np.stack([np.sqrt(std**2 - shared**2), shared], axis=1)[..., None]:
+            covariance = (component_std * correlations * component_std.swapaxes(1, 2)).sum(axis=0)
             self._factors.append(cholesky(covariance, lower=True))
-        self.points, self.face = probe.points[known], probe.face[known]
+        self.points, self.face = probe.points[is_measured], probe.face[is_measured]
         arm = self.points @ probe.axes
         arm -= arm.mean(axis=0)
-        there = arm + field[:2, known].T
-        there -= there.mean(axis=0)
+        deformed = arm + field[:2, is_measured].T
+        deformed -= deformed.mean(axis=0)
         # the series is that of small rotations: the body's, from the best one (Kabsch), is then that of its own term
-        angle = np.arctan2((arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum(), (arm * there).sum())
+        angle = np.arctan2((arm[:, 0] * deformed[:, 1] - arm[:, 1] * deformed[:, 0]).sum(), (arm * deformed).sum())
         for last in (False, True):
             turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-            self.turned, data = probe.axes @ turn, there - arm @ turn
+            self.turned, data = probe.axes @ turn, deformed - arm @ turn
             if not last:
                 series = probe.series(self.points, self.face, range(probe.most_terms + 1)).reshape(2 * len(arm), -1)
                 rotation = np.linalg.lstsq(series, (data @ self.turned.T).ravel(), rcond=None)[0][5]
                 angle += (probe.williams.kolosov + 1) * rotation / probe.radii[1]
         self.data = self.whiten(data.T[:, :, None])[:, 0]
 
-    def whiten(self, parts: FloatArray) -> FloatArray:
+    def whiten(self, fields: FloatArray) -> FloatArray:
         """Divide fields (2, m, p) by their errors, (2 m, p)."""
-        factors = zip(self._factors, parts, strict=True)
-        return np.concatenate([solve_triangular(factor, part, lower=True) for factor, part in factors])
+        factors = zip(self._factors, fields, strict=True)
+        return np.concatenate([solve_triangular(factor, component, lower=True) for factor, component in factors])
 
     def series(self, orders: range, tip: float = 0.0) -> FloatArray:
         """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""
@@ -423,8 +431,8 @@ class _Weighted:
 
     def misfits(self, orders: range) -> FloatArray:
         """Chi-square of the best fit of the terms up to each."""
-        taken = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
-        return np.asarray((self.data**2).sum() - np.cumsum((taken**2).reshape(-1, 2).sum(axis=1)))
+        projections = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
+        return np.asarray((self.data**2).sum() - np.cumsum((projections**2).reshape(-1, 2).sum(axis=1)))
 
     def fit(self, terms: int) -> tuple[FloatArray, FloatArray, float] | None:
         """Fit the terms: coefficients, their covariance, and chi-square over its degrees of freedom.
@@ -446,8 +454,8 @@ class _Weighted:
                 return np.r_[solved[0][:-1], tip], *solved[1:]
         return None if fit_tip else solved
 
-    def _solved(self, parts: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        design = self.whiten(parts)
+    def _solved(self, series: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        design = self.whiten(series)
         q, triangle = np.linalg.qr(design)
         inverse = solve_triangular(triangle, np.eye(len(triangle)))
         values = inverse @ (q.T @ self.data)
@@ -492,4 +500,4 @@ def stress_intensity(
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = CrackTip(covariance, "the tip", *tip, *radii, williams=williams)
-    return probe.read(at_some(displacement, probe.nodes))
+    return probe.read(select_nodes(displacement, probe.nodes))

@@ -60,33 +60,37 @@ class JumpAlong:
         from scipy.sparse.csgraph import dijkstra
 
         mesh, faces = covariance.mesh, crack_faces(covariance.mesh)
-        places = mesh.merged_index[faces]
-        ends = [nearest_node(mesh, name, places.ravel(), np.array(place[i : i + 2])) for i in (0, 2)]
+        merged_nodes = mesh.merged_index[faces]
+        ends = [nearest_node(mesh, name, merged_nodes.ravel(), np.array(place[i : i + 2])) for i in (0, 2)]
         length = np.hypot(*(mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]).T)
-        graph = csr_matrix((length, places.T), shape=(len(mesh.nodes),) * 2)
+        graph = csr_matrix((length, merged_nodes.T), shape=(len(mesh.nodes),) * 2)
         before = dijkstra(graph, directed=False, indices=np.array(ends[0]), return_predecessors=True)[1]
         path = [ends[1]]
         while before[path[-1]] >= 0:
             path.append(int(before[path[-1]]))
         path.reverse()
         if path[0] != ends[0] or len(path) < 2:
-            raise InputError(f"{name} needs two different points of one crack of the mesh, not {listed(place)} px")
+            raise InputError(
+                f"{name} needs two different points of one crack of the mesh, not {comma_separated(place)} px"
+            )
         # an element is on the right of its sides as these run: the image has y down
-        face = dict(zip(map(tuple, places.tolist()), faces.tolist(), strict=True))
+        face = dict(zip(map(tuple, merged_nodes.tolist()), faces.tolist(), strict=True))
         steps = np.array([(face[end, start][::-1], face[start, end]) for start, end in pairwise(path)])
         arrives = np.concatenate([steps[:1, :, 0], steps[:, :, 1]])
         leaves = np.concatenate([steps[:, :, 0], steps[-1:, :, 1]])
-        one = (arrives == leaves).all(axis=1)  # else another crack branches off here
+        is_single = (arrives == leaves).all(axis=1)  # else another crack branches off here
         # sides (n, 2): node on the left and on the right of each of `points`, as place in `nodes`; the same at a tip.
-        # `used` (P, 6): those of each pair and of the points before and after it
-        self.pairs = np.flatnonzero(one & (arrives[:, 0] != arrives[:, 1]))
+        # `stencil` (P, 6): those of each pair and of the points before and after it
+        self.pairs = np.flatnonzero(is_single & (arrives[:, 0] != arrives[:, 1]))
         if not len(self.pairs):
-            raise InputError(f"no pair of nodes lies on the crack between the points {listed(place)} px of {name}")
+            raise InputError(
+                f"no pair of nodes lies on the crack between the points {comma_separated(place)} px of {name}"
+            )
         self.name, self.points = name, mesh.nodes[path]
         self.nodes, index = np.unique(arrives, return_inverse=True)
         sides = index.reshape(-1, 2)
-        self.used = sides[np.stack([self.pairs, *self._beside], axis=1)].reshape(-1, 6)
-        self.covariances = [covariance.part(self.nodes[row]) for row in self.used]
+        self.stencil = sides[np.stack([self.pairs, *self._beside], axis=1)].reshape(-1, 6)
+        self.covariances = [covariance.subset(self.nodes[row]) for row in self.stencil]
 
     @property
     def _beside(self) -> tuple[IntArray, IntArray]:
@@ -95,19 +99,22 @@ class JumpAlong:
 
     def read(self, nodal: Nodal) -> Jump:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
-        before, after = self._beside
+        previous, following = self._beside
         across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
-        u, *stds = nodal.fields[..., self.used].reshape(3, 2, len(nodal.u), *self.used.shape)
-        jump, arm = u @ across, (self.points[after] - self.points[before]).T[:, None] + u @ along
+        u, *stds = nodal.fields[..., self.stencil].reshape(3, 2, len(nodal.u), *self.stencil.shape)
+        jump, arm = u @ across, (self.points[following] - self.points[previous]).T[:, None] + u @ along
         length = np.hypot(*arm)
         tangent = arm / length
         normal = np.stack([tangent[1], -tangent[0]])
         opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
 
         def error(axis: FloatArray, turn: FloatArray) -> FloatArray:
-            parts = axis[..., None] * across + turn[..., None] * along
+            coefficients = axis[..., None] * across + turn[..., None] * along
             pairs = enumerate(self.covariances)
-            square = [one.variance(parts[:, :, p], *(std[:, :, p] for std in stds)).sum(axis=0) for p, one in pairs]
+            square = [
+                covariance.variance(coefficients[:, :, p], *(std[:, :, p] for std in stds)).sum(axis=0)
+                for p, covariance in pairs
+            ]
             return np.asarray(np.sqrt(np.stack(square, axis=1)))
 
         # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
@@ -124,20 +131,20 @@ class JumpAlong:
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute opening and sliding of every pair in px."""
         jump = self.read(nodal)
-        where = ", ".join(f"{distance:.4g}" for distance in jump.distance)
+        positions = ", ".join(f"{distance:.4g}" for distance in jump.distance)
         note = (
             f"{self.name}: jump of the left side against the right one, across and along the deformed crack, at its "
-            f"pairs of nodes 1 to {len(self.pairs)}, which are {where} px from its first point"
+            f"pairs of nodes 1 to {len(self.pairs)}, which are {positions} px from its first point"
         )
-        parts = {"opening": (jump.opening, jump.opening_std), "sliding": (jump.sliding, jump.sliding_std)}
+        components = {"opening": (jump.opening, jump.opening_std), "sliding": (jump.sliding, jump.sliding_std)}
         return [
-            History(name=f"{self.name}_{pair}_{kind}", unit="px", values=one, std=error, note=note)
-            for kind, (values, std) in parts.items()
-            for pair, (one, error) in enumerate(zip(values.T, std.T, strict=True), start=1)
+            History(name=f"{self.name}_{pair}_{kind}", unit="px", values=series, std=error, note=note)
+            for kind, (values, std) in components.items()
+            for pair, (series, error) in enumerate(zip(values.T, std.T, strict=True), start=1)
         ]
 
 
-def listed(numbers: Any) -> str:
+def comma_separated(numbers: Any) -> str:
     """Numbers with commas between them."""
     return ", ".join(f"{number:g}" for number in numbers)
 
@@ -148,18 +155,21 @@ def crack_faces(mesh: Tri3Mesh) -> IntArray:
     return sides[np.isin(edge_keys(sides, len(mesh.nodes)), edge_keys(mesh.crack_edges, len(mesh.nodes)))].astype(int)
 
 
-def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, what: str = "on a crack") -> int:
+def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, description: str = "on a crack") -> int:
     """Return the one of some nodes at a stated point, px."""
     if not len(nodes):
-        raise InputError(f"{name}: no node of this result is {what}; cracks are stated in [mesh] cracks before the run")
-    nodes = np.unique(nodes)
-    away = np.hypot(*(mesh.nodes[nodes] - point).T)
-    nearest = int(nodes[np.argmin(away)])
-    near = 0.5 * mesh.size  # where a path of `[mesh] cracks` is moved, it is by as much
-    if away.min() > near:
         raise InputError(
-            f"{name} at ({listed(point)}) px is not {what} of the mesh; the nearest node that is lies at "
-            f"({listed(mesh.nodes[nearest].round(1))}) px, {away.min():.3g} px away; {near:.3g} px count"
+            f"{name}: no node of this result is {description}; cracks are stated in [mesh] cracks before the run"
+        )
+    nodes = np.unique(nodes)
+    distance = np.hypot(*(mesh.nodes[nodes] - point).T)
+    nearest = int(nodes[np.argmin(distance)])
+    near = 0.5 * mesh.size  # where a path of `[mesh] cracks` is moved, it is by as much
+    if distance.min() > near:
+        raise InputError(
+            f"{name} at ({comma_separated(point)}) px is not {description} of the mesh; the nearest node that is "
+            f"lies at ({comma_separated(mesh.nodes[nearest].round(1))}) px, {distance.min():.3g} px away; {near:.3g} "
+            "px count"
         )
     return nearest
 
@@ -196,9 +206,9 @@ def crack_jump(
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = JumpAlong(covariance, "the crack", *start, *end)
-    return probe.read(at_some(displacement, probe.nodes))
+    return probe.read(select_nodes(displacement, probe.nodes))
 
 
-def at_some(nodal: Nodal, nodes: IntArray) -> Nodal:
+def select_nodes(nodal: Nodal, nodes: IntArray) -> Nodal:
     """Displacements at some of the nodes."""
     return Nodal.of(nodal.fields[..., nodes])

@@ -68,8 +68,8 @@ class Nodal:
     @property
     def fields(self) -> FloatArray:
         """All of them in their order, (6, T, m)."""
-        parts = (self.u, self.v, self.u_std, self.v_std, self.u_bias, self.v_bias)
-        return np.stack(np.broadcast_arrays(*parts))
+        arrays = (self.u, self.v, self.u_std, self.v_std, self.u_bias, self.v_bias)
+        return np.stack(np.broadcast_arrays(*arrays))
 
     @property
     def components(self) -> FloatArray:
@@ -108,15 +108,15 @@ class History:
         return column(self.name, self.unit)
 
 
-Part = tuple[str, str, FloatArray, FloatArray | None]
+ProbeQuantity = tuple[str, str, FloatArray, FloatArray | None]
 """Name, unit, values (T,) and standard uncertainty of a quantity that a probe measures."""
 
 
-def histories_of(probe: str, parts: Iterable[Part], note: str = "") -> list[History]:
+def histories_of(probe: str, quantities: Iterable[ProbeQuantity], note: str = "") -> list[History]:
     """Return the histories of a probe, named by it and their quantity, with one note."""
     return [
         History(name=f"{probe}_{name}", unit=unit, values=values, std=std, note=note)
-        for name, unit, values, std in parts
+        for name, unit, values, std in quantities
     ]
 
 
@@ -210,9 +210,10 @@ def rate_frames(window: int, measured: int) -> int:
 
 def rate_words(window: int, measured: int) -> str:
     """Return over how many frames the polynomials of rates are fitted."""
-    taken = rate_frames(window, measured)
-    fewer = "" if taken == window else f" (a window of {window} was stated)"
-    return f"parabolas over {taken} frames{fewer}, polynomials of degree 4 over {min(measured, round(5 * taken / 3))}"
+    fitted_frames = rate_frames(window, measured)
+    fewer = "" if fitted_frames == window else f" (a window of {window} was stated)"
+    longest = min(measured, round(5 * fitted_frames / 3))
+    return f"parabolas over {fitted_frames} frames{fewer}, polynomials of degree 4 over {longest}"
 
 
 @checked
@@ -257,36 +258,42 @@ def rates(
     InputError
         The times do not rise, shapes differ, or no window has enough frames.
     """
-    when, what, error = (np.asarray(part, dtype=np.float64) for part in (times, values, std))
+    frame_times, quantity, error = (np.asarray(array, dtype=np.float64) for array in (times, values, std))
     references = np.asarray(references, dtype=bool)
-    if not (when.ndim == references.ndim == 1 and what.ndim and when.size):
-        raise InputError(f"rates need times (T,) and references (T,), not {when.shape} and {references.shape}")
-    if what.shape != error.shape or len(when) != len(what) or len(references) != len(when):
-        raise InputError(f"rates need a time for each frame, not {when.shape} for values {what.shape}, {error.shape}")
-    if not (np.diff(when) > 0).all():
+    if not (frame_times.ndim == references.ndim == 1 and quantity.ndim and frame_times.size):
+        raise InputError(f"rates need times (T,) and references (T,), not {frame_times.shape} and {references.shape}")
+    if quantity.shape != error.shape or len(frame_times) != len(quantity) or len(references) != len(frame_times):
+        raise InputError(
+            f"rates need a time for each frame, not {frame_times.shape} for values {quantity.shape}, {error.shape}"
+        )
+    if not (np.diff(frame_times) > 0).all():
         raise InputError("rates need the times of the frames to rise from each to the next")
     reach = 1.01 * window  # cameras round time stamps, to 1 us at 10,000 frames a second
-    most = int((np.searchsorted(when, when + reach, side="right") - np.arange(len(when))).max())
-    if most < FEWEST:
+    max_frames = int(
+        (np.searchsorted(frame_times, frame_times + reach, side="right") - np.arange(len(frame_times))).max()
+    )
+    if max_frames < FEWEST:
         raise InputError(
-            f"a window of {window:g} holds no more than {most} frames; a polynomial of degree {LOWEST} needs "
+            f"a window of {window:g} holds no more than {max_frames} frames; a polynomial of degree {LOWEST} needs "
             f"{FEWEST} or more"
         )
-    flat, spread = (np.ascontiguousarray(part.reshape(len(when), -1).T) for part in (what, error))
-    scaled = (when - when[0]) / reach
+    flat, spread = (np.ascontiguousarray(array.reshape(len(frame_times), -1).T) for array in (quantity, error))
+    scaled = (frame_times - frame_times[0]) / reach
     noise, common = _noise(scaled, flat, spread, common_fraction, references)
-    out = np.full((len(flat), 2, len(_POWERS), len(when)), np.nan)
+    out = np.full((len(flat), 2, len(_POWERS), len(frame_times)), np.nan)
     weight = references / max(references.sum(), 1)
-    mean_rates(scaled, np.nan_to_num(flat), noise, common, weight, most, out)
+    mean_rates(scaled, np.nan_to_num(flat), noise, common, weight, max_frames, out)
     out[:, 1] = np.sqrt(np.maximum(out[:, 1], 0))
     out /= reach ** np.array(list(_POWERS.values()), dtype=np.float64)[:, None]
-    before, after = out[:, :, 3:5], out[:, :, 5:]
+    before_kink, after_kink = out[:, :, 3:5], out[:, :, 5:]
     with np.errstate(invalid="ignore"):  # a kink is 4 standard uncertainties: in noise once in 16,000 frames
-        kink = (np.abs(after[:, 0] - before[:, 0]) > 4 * np.hypot(after[:, 1], before[:, 1])).any(axis=1)
+        kink = (np.abs(after_kink[:, 0] - before_kink[:, 0]) > 4 * np.hypot(after_kink[:, 1], before_kink[:, 1])).any(
+            axis=1
+        )
     out[:, :, 3:] = np.where(kink[:, None, None], out[:, :, 3:], np.nan)
-    named = out.transpose(1, 2, 3, 0).reshape(2, len(_POWERS), *what.shape)
+    by_quantity = out.transpose(1, 2, 3, 0).reshape(2, len(_POWERS), *quantity.shape)
     return Rates(
-        **{f"{name}{end}": named[j, i] for i, name in enumerate(_POWERS) for j, end in enumerate(("", "_std"))}
+        **{f"{name}{end}": by_quantity[j, i] for i, name in enumerate(_POWERS) for j, end in enumerate(("", "_std"))}
     )
 
 
@@ -298,18 +305,20 @@ def _noise(
     As in `frame_covariance`, two frames have the reference's part of the smaller variance in common, here that of the
     least in half a window to both sides. A frame of the reference has the noise of the others alone.
     """
-    known = np.isfinite(values) & np.isfinite(std)
-    variance = np.where(known, std, 0.0) ** 2
-    others = np.where(known & ~references, variance, np.inf)
+    is_measured = np.isfinite(values) & np.isfinite(std)
+    variance = np.where(is_measured, std, 0.0) ** 2
+    other_variance = np.where(is_measured & ~references, variance, np.inf)
     first, last = np.searchsorted(times, times - 0.5), np.searchsorted(times, times + 0.5, side="right")
-    least = np.stack([others[:, a:b].min(axis=1) for a, b in zip(first, last, strict=True)], axis=1)
-    least = np.where(np.isfinite(least), least, others.min(axis=1, keepdims=True))
-    least = np.where(np.isfinite(least), least, variance / (1 - fraction))
-    noise = np.sqrt(np.where(references, (1 - fraction) * least, np.maximum(variance - fraction * least, 0)))
+    min_variance = np.stack([other_variance[:, a:b].min(axis=1) for a, b in zip(first, last, strict=True)], axis=1)
+    min_variance = np.where(np.isfinite(min_variance), min_variance, other_variance.min(axis=1, keepdims=True))
+    min_variance = np.where(np.isfinite(min_variance), min_variance, variance / (1 - fraction))
+    noise = np.sqrt(
+        np.where(references, (1 - fraction) * min_variance, np.maximum(variance - fraction * min_variance, 0))
+    )
     middle, size = np.median(noise, axis=1), np.abs(np.nan_to_num(values)).max(axis=1)
     # a value that is stated without noise does not outweigh all others
     floor = np.where(middle > 0, 1e-3 * middle, 1e-9 * size + np.finfo(float).tiny)
-    return np.where(known, np.maximum(noise, floor[:, None]), 0.0), fraction * least
+    return np.where(is_measured, np.maximum(noise, floor[:, None]), 0.0), fraction * min_variance
 
 
 @checked
@@ -342,32 +351,32 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
     values = np.asarray(field, dtype=np.float64)
     if values.ndim != 2 or not 0 < sigma < 1e6:
         raise InputError(f"one image (H, W) and a positive sigma are needed, not shape {values.shape}, sigma {sigma!r}")
-    known = np.isfinite(values)
-    if known.sum() < 10:
+    is_measured = np.isfinite(values)
+    if is_measured.sum() < 10:
         raise InputError("the field is measured at fewer than 10 pixels")
-    trend, laplacian = _quadratic_trend(values, known)
-    rest = np.where(known, values - trend, 0.0)
+    trend, laplacian = _quadratic_trend(values, is_measured)
+    residual = np.where(is_measured, values - trend, 0.0)
     # zeros beyond the image, which the normalisation corrects; what is filtered is small beside the displacement
     # itself: single precision holds it to 1e-7 px
     total, weight = (
-        cv2.GaussianBlur(part.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT).astype(np.float64)
-        for part in (rest, known)
+        cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT).astype(np.float64)
+        for image in (residual, is_measured)
     )
-    least = 1e-3  # of the weight on measured pixels: single precision then holds the mean to 1e-4
-    smooth = total / np.maximum(weight, least)
-    usable = known & (weight > least)
-    return np.where(usable, rest - smooth - sigma**2 / 2 * laplacian, np.nan)
+    min_weight = 1e-3  # of the weight on measured pixels: single precision then holds the mean to 1e-4
+    smooth = total / np.maximum(weight, min_weight)
+    usable = is_measured & (weight > min_weight)
+    return np.where(usable, residual - smooth - sigma**2 / 2 * laplacian, np.nan)
 
 
-def _quadratic_trend(values: FloatArray, known: BoolArray) -> tuple[FloatArray, float]:
+def _quadratic_trend(values: FloatArray, is_measured: BoolArray) -> tuple[FloatArray, float]:
     """Fit a polynomial of degree 2 in x and y (H, W) by least squares; return it and its Laplacian."""
     scale = float(max(values.shape))
     y, x = (axis / scale for axis in np.mgrid[: values.shape[0], : values.shape[1]])
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    step = max(1, int(np.sqrt(known.sum() / 20_000)))
-    some = np.zeros_like(known)
-    some[::step, ::step] = known[::step, ::step]
-    if some.sum() < 10:
-        some = known
-    coefficients = np.linalg.lstsq(basis[some], values[some], rcond=None)[0]
+    step = max(1, int(np.sqrt(is_measured.sum() / 20_000)))
+    sample = np.zeros_like(is_measured)
+    sample[::step, ::step] = is_measured[::step, ::step]
+    if sample.sum() < 10:
+        sample = is_measured
+    coefficients = np.linalg.lstsq(basis[sample], values[sample], rcond=None)[0]
     return basis @ coefficients, float(2 * (coefficients[3] + coefficients[5]) / scale**2)

@@ -20,6 +20,7 @@ from rgbmidic.arguments import checked
 from rgbmidic.correlation.recovery import nodal_slopes
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 _ROUNDING = 1e-6
@@ -28,8 +29,9 @@ _AT_ONCE = 20_000
 """Points whose elements are searched at once: some 60 MB (derived)."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Places:
+class MeshPoints:
     """Points in a mesh: their elements and barycentric coordinates.
 
     Attributes
@@ -64,15 +66,15 @@ class Places:
 
         Returns
         -------
-        Places
+        MeshPoints
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         middle, slopes, element = mesh.centres, mesh.shape_gradients(), np.empty(len(points), dtype=np.int64)
         count = min(24, len(middle))  # the nearest elements: their sizes in one mesh differ by a factor of 2
         for start in range(0, len(points), _AT_ONCE):
-            part = points[start : start + _AT_ONCE]
-            near = np.asarray(mesh.centre_tree.query(part, k=count)[1]).reshape(-1, count)
-            shape = np.einsum("pced,pcd->pce", slopes[near], part[:, None] - middle[near])
+            batch = points[start : start + _AT_ONCE]
+            near = np.asarray(mesh.centre_tree.query(batch, k=count)[1]).reshape(-1, count)
+            shape = np.einsum("pced,pcd->pce", slopes[near], batch[:, None] - middle[near])
             element[start : start + _AT_ONCE] = near[np.arange(len(near)), shape.min(axis=2).argmax(axis=1)]
         return cls.within(mesh, points, element)
 
@@ -91,15 +93,15 @@ class Places:
 
         Returns
         -------
-        Places
+        MeshPoints
         """
-        away = points - mesh.centres[element]
-        barycentric = 1 / 3 + np.einsum("pcd,pd->pc", mesh.shape_gradients()[element], away)
+        offset = points - mesh.centres[element]
+        barycentric = 1 / 3 + np.einsum("pcd,pd->pc", mesh.shape_gradients()[element], offset)
         inside = barycentric.min(axis=1) >= -_ROUNDING
         return cls(mesh=mesh, points=points, inside=inside, element=element, barycentric=barycentric)
 
     @classmethod
-    def parts(cls, mesh: Tri3Mesh, along: int) -> tuple[Self, npt.NDArray[np.int32]]:
+    def subdivide(cls, mesh: Tri3Mesh, along: int) -> tuple[Self, npt.NDArray[np.int32]]:
         """Divide each element, for pictures of the field that are linear in the parts.
 
         Parameters
@@ -113,40 +115,40 @@ class Places:
         -------
         places : Places
             Corners of the parts, those of each element apart.
-        parts : ndarray, shape (E along^2, 3), int32
+        triangles : ndarray, shape (E along^2, 3), int32
             Indices of the corners of each part.
         """
         steps = [(i, j) for i in range(along + 1) for j in range(along + 1 - i)]
         index = {step: number for number, step in enumerate(steps)}
         up = [((i, j), (i + 1, j), (i, j + 1)) for i, j in steps if i + j < along]
         down = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in steps if i + j < along - 1]
-        parts = np.array([[index[corner] for corner in part] for part in up + down])
+        subtriangles = np.array([[index[corner] for corner in triangle] for triangle in up + down])
         second, third = np.array(steps).T / along
         shape = np.stack([1 - second - third, second, third], axis=1)
         points = np.einsum("sc,ecd->esd", shape, mesh.nodes[mesh.elements]).reshape(-1, 2)
         element = np.arange(len(mesh.elements))
-        corners = (len(steps) * element[:, None, None] + parts).reshape(-1, 3)
+        corners = (len(steps) * element[:, None, None] + subtriangles).reshape(-1, 3)
         return cls.within(mesh, points, np.repeat(element, len(steps))), corners.astype(np.int32)
 
-    def check(self, what: str) -> None:
+    def check(self, description: str) -> None:
         """Refuse points outside the mesh.
 
         Parameters
         ----------
-        what
+        description
             What the points are, for the message.
 
         Raises
         ------
         InputError
-            One is; the message names it after `what`.
+            One is; the message names it after `description`.
         """
         if not self.inside.all():
             x, y = self.points[~self.inside][0]
-            raise InputError(f"{what} at ({x:g}, {y:g}) px is outside {self.where}")
+            raise InputError(f"{description} at ({x:g}, {y:g}) px is outside {self.bounds_text}")
 
     @property
-    def where(self) -> str:
+    def bounds_text(self) -> str:
         """Text for messages with the bounds of the region."""
         (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
         return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
@@ -198,7 +200,7 @@ class Places:
         csr_matrix, shape (P, N)
         """
         fits = _fits(self.mesh, has_data.tobytes())
-        return sp.csr_matrix(sum(one @ fit for one, fit in zip(self._matrices(), fits, strict=True)))
+        return sp.csr_matrix(sum(matrix @ fit for matrix, fit in zip(self._matrices(), fits, strict=True)))
 
     def read(self, values: FloatArray) -> FloatArray:
         """Evaluate nodal fields at the points.
@@ -216,7 +218,7 @@ class Places:
         valid = np.isfinite(values)
         has_data = np.asarray(valid.reshape(len(values), -1).all(axis=1))
         terms = (fit @ np.where(valid, values, 0) for fit in _fits(self.mesh, has_data.tobytes()))
-        field = np.asarray(sum(one @ term for one, term in zip(self._matrices(), terms, strict=True)))
+        field = np.asarray(sum(matrix @ term for matrix, term in zip(self._matrices(), terms, strict=True)))
         field[~self.measured(has_data)] = np.nan
         return field
 
@@ -261,8 +263,8 @@ class Places:
         else:
             shape, inner = self.mesh.shape_gradients()[self.element, :, axis], np.eye(2)[axis]
         yield shape
-        for arm, one in zip(arms, inner, strict=True):
-            yield (shape * arm + self.barycentric * one) / 2
+        for arm, derivative in zip(arms, inner, strict=True):
+            yield (shape * arm + self.barycentric * derivative) / 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -273,14 +275,14 @@ class PointSum:
     ----------
     nodes : ndarray, shape (m,), int
         Nodes of the mesh on which it depends.
-    part
+    submesh
         The mesh of these alone.
     inside
         Fraction of the points that lie in the mesh: the others take no part.
     count : ndarray, shape (G,)
         Fraction of the latter in each group: those of an element that depend on the same of its corners.
     corners : ndarray, shape (G, 3), int
-        These, in `part`.
+        These, in `submesh`.
     needed : ndarray, shape (G, 3), bool
         Those on which the group depends: the field at a node depends on this one, slopes depend on all.
     moments : ndarray, shape (S, 3, G, 3)
@@ -288,7 +290,7 @@ class PointSum:
     """
 
     nodes: IntArray
-    part: Tri3Mesh
+    submesh: Tri3Mesh
     inside: float
     count: FloatArray
     corners: IntArray
@@ -296,9 +298,9 @@ class PointSum:
     moments: FloatArray
 
     @classmethod
-    def over(cls, places: Places, factors: FloatArray, *, slopes: bool = False) -> Self:
+    def over(cls, points: MeshPoints, factors: FloatArray, *, slopes: bool = False) -> Self:
         """Sum over places, one at least inside, with factors (P,)."""
-        nodes, near = places.nearby()
+        nodes, near = points.nearby()
         inside, needed = near.inside, slopes | (np.abs(near.barycentric) > _ROUNDING)
         _, first, group, count = np.unique(
             8 * near.element[inside] + needed[inside] @ (1, 2, 4),
@@ -309,18 +311,18 @@ class PointSum:
         sums = sp.csr_matrix(
             (factors[inside], (group.ravel(), np.flatnonzero(inside))), shape=(len(first), len(inside))
         )
-        chosen = np.flatnonzero(inside)[first]
+        group_points = np.flatnonzero(inside)[first]
         return cls(
             nodes=nodes,
-            part=near.mesh,
+            submesh=near.mesh,
             inside=float(inside.mean()),
             count=count / count.sum(),
-            corners=near.mesh.elements[near.element[chosen]].astype(np.int64),
-            needed=needed[chosen],
+            corners=near.mesh.elements[near.element[group_points]].astype(np.int64),
+            needed=needed[group_points],
             moments=np.array(
-                [[sums @ one for one in near.factors(axis)] for axis in ((None, 0, 1) if slopes else (None,))]
+                [[sums @ factor for factor in near.factors(axis)] for axis in ((None, 0, 1) if slopes else (None,))]
             )
-            * needed[chosen],
+            * needed[group_points],
         )
 
     def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, float]:
@@ -341,18 +343,18 @@ class PointSum:
         """
         measured = (has_data[self.corners] | ~self.needed).all(axis=1)
         node, weights = self.corners[measured].ravel(), np.zeros((len(self.moments), len(has_data)))
-        fits = _fits(self.part, has_data.tobytes())[: 1 if linear else None]
+        fits = _fits(self.submesh, has_data.tobytes())[: 1 if linear else None]
         for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=False):
-            each = [np.bincount(node, weights=one.ravel(), minlength=len(has_data)) for one in sums]
-            weights += np.asarray(each) @ fit
+            nodal_weights = [np.bincount(node, weights=moment.ravel(), minlength=len(has_data)) for moment in sums]
+            weights += np.asarray(nodal_weights) @ fit
         return weights, float(self.count[measured].sum())
 
 
 @lru_cache(maxsize=4)  # a few meshes, as a rule with data at all nodes: 8 MB each for 8,000 of them
 def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     """Matrices (N, N) from nodal values to the value at each node and to its slopes along x and y."""
-    used = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))
-    return sp.eye(len(mesh.nodes), format="csr"), *nodal_slopes(mesh, used)
+    is_complete = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))
+    return sp.eye(len(mesh.nodes), format="csr"), *nodal_slopes(mesh, is_complete)
 
 
 @checked
@@ -384,9 +386,9 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
         )
     pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
     element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
-    places = Places.within(mesh, np.stack([pixels.columns, pixels.rows], axis=1).astype(np.float64), element)
-    field = replace(places, inside=np.ones(len(element), dtype=bool)).read(values)
-    return np.stack([pixels.scatter(part, fill=np.nan) for part in field.T])
+    points = MeshPoints.within(mesh, np.stack([pixels.columns, pixels.rows], axis=1).astype(np.float64), element)
+    field = replace(points, inside=np.ones(len(element), dtype=bool)).read(values)
+    return np.stack([pixels.scatter(component, fill=np.nan) for component in field.T])
 
 
 @checked

@@ -27,12 +27,14 @@ from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodalCovariance:
     """Covariance of the errors of one displacement component between nodes; u and v are not correlated.
@@ -98,8 +100,8 @@ class NodalCovariance:
         csr_matrix, shape (n, R + S)
         """
         shared = np.minimum(bias, std)
-        parts = sp.diags(np.sqrt(std**2 - shared**2)) @ self.fit, sp.diags(shared) @ self.bias
-        return sp.csr_matrix(sp.hstack(parts))
+        blocks = sp.diags(np.sqrt(std**2 - shared**2)) @ self.fit, sp.diags(shared) @ self.bias
+        return sp.csr_matrix(sp.hstack(blocks))
 
     def errors(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
         """Resolve the errors of weighted sums of nodal values into independent errors of unit variance.
@@ -122,10 +124,10 @@ class NodalCovariance:
         weights, std = np.asarray(weights), np.asarray(std)
         shared = np.minimum(bias, std)
         stds = np.sqrt(std**2 - shared**2), shared
-        parts = [np.where(weights != 0, weights * part, 0.0) for part in stds]
-        shape = parts[0].shape[:-1]
-        factors = zip(parts, (self.fit, self.bias), strict=True)
-        flat = [part.reshape(-1, part.shape[-1]) @ factor for part, factor in factors]
+        weighted_stds = [np.where(weights != 0, weights * array, 0.0) for array in stds]
+        shape = weighted_stds[0].shape[:-1]
+        factors = zip(weighted_stds, (self.fit, self.bias), strict=True)
+        flat = [array.reshape(-1, array.shape[-1]) @ factor for array, factor in factors]
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
     def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
@@ -154,10 +156,10 @@ class NodalCovariance:
         -------
         NodalCovariance
         """
-        fit, bias = (unit_rows(sp.hstack([one @ root for one in matrices])) for root in (self.fit, self.bias))
+        fit, bias = (unit_rows(sp.hstack([matrix @ root for matrix in matrices])) for root in (self.fit, self.bias))
         return replace(self, fit=fit, bias=bias)
 
-    def part(self, nodes: IntArray) -> Self:
+    def subset(self, nodes: IntArray) -> Self:
         """Return the covariance of some nodes alone.
 
         Parameters
@@ -192,10 +194,10 @@ def _windows(nodes: FloatArray) -> sp.csr_matrix:
     at = nodes / USUAL.bias_range
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
-    places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
+    centre_index = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
     heights = y[:, :, None] * x[:, None]
     node, row, column = np.nonzero(heights > 0.007)  # of 1: the correlation is right to .01
-    return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
+    return unit_rows(sp.csr_matrix((heights[node, row, column], (node, centre_index[node, row, column]))))
 
 
 def unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
@@ -263,9 +265,9 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
             "frames have 1/2 of their variance in common or less, above 0, and each belongs to the reference or not; "
             f"given are {common_fraction:g}, and {reference.shape} for {variance.shape}"
         )
-    either, both = reference[:, None] | reference[None], reference[:, None] & reference[None]
+    either_reference, both_references = reference[:, None] | reference[None], reference[:, None] & reference[None]
     count = round(1 / common_fraction) - 1
-    factor = np.where(both, -1 / max(count - 1, 1), np.where(either, 0.0, common_fraction))
+    factor = np.where(both_references, -1 / max(count - 1, 1), np.where(either_reference, 0.0, common_fraction))
     np.fill_diagonal(factor, 1.0)
     factor = factor.reshape(factor.shape + (1,) * (variance.ndim - 1))
     return np.asarray(factor * np.minimum(variance[:, None], variance[None]))
@@ -340,26 +342,28 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
-        if known.sum() < 2:
+        nodes, is_measured = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
+        if is_measured.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
-        centre = nodes[known].mean(axis=0)
-        arm, moved = nodes[known] - centre, np.stack([u, v], axis=1)[known]
-        shift = moved.mean(axis=0)
-        there = arm + moved - shift
-        along, turned = (arm * there).sum(), (arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum()
-        even = known / known.sum()
+        centre = nodes[is_measured].mean(axis=0)
+        arm, displacement = nodes[is_measured] - centre, np.stack([u, v], axis=1)[is_measured]
+        shift = displacement.mean(axis=0)
+        deformed = arm + displacement - shift
+        along, turned = (arm * deformed).sum(), (arm[:, 0] * deformed[:, 1] - arm[:, 1] * deformed[:, 0]).sum()
+        equal_weights = is_measured / is_measured.sum()
         lever, angle = np.zeros((2, len(nodes))), float(np.arctan2(turned, along))
         # d(angle) = sum of (arm, turned along) x d(moved) / (arm . there)
         c, s = np.cos(angle), np.sin(angle)
-        lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
+        lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
         u_std, v_std = std[::2], std[1::2]
         turning = covariance.variance(lever[0], *u_std) + covariance.variance(lever[1], *v_std)
         return cls(
             centre=centre,
             shift=shift,
-            shift_std=np.sqrt(np.array([covariance.variance(even, *part) for part in (u_std, v_std)])),
+            shift_std=np.sqrt(
+                np.array([covariance.variance(equal_weights, *component_std) for component_std in (u_std, v_std)])
+            ),
             rotation=angle,
             rotation_std=float(np.sqrt(turning)),
         )
@@ -385,8 +389,8 @@ class RigidMotion:
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         back = np.array([[c, s], [-s, c]])
         arm = nodes - self.centre
-        left = (arm + field[:2].T - self.shift) @ back.T - arm
-        return np.concatenate([left.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
+        remaining = (arm + field[:2].T - self.shift) @ back.T - arm
+        return np.concatenate([remaining.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
 
     def at(self, points: FloatArray) -> FloatArray:
         """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.

@@ -24,6 +24,7 @@ from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray, as_numbers
@@ -107,11 +108,11 @@ class CameraCalibration:
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
         for key, shape in (("lens", (8,)), ("homography", (3, 3)), ("covariance", (16, 16))):
-            given = getattr(self, key)
-            if given is None:
+            value = getattr(self, key)
+            if value is None:
                 continue
             needed = f"{self.name}: {key} must be finite with shape {shape}"
-            values = as_numbers(given, needed, shape, error=CalibrationError)
+            values = as_numbers(value, needed, shape, error=CalibrationError)
             object.__setattr__(self, key, values)
         if self.lens is not None and self.lens[0] <= 0:
             raise CalibrationError(f"{self.name}: the focal length must be positive, not {self.lens[0]:g} px")
@@ -200,8 +201,8 @@ class CameraCalibration:
             steps = np.eye(2) / 2
             bent = np.stack([distorted(lens, straight + h) - distorted(lens, straight - h) for h in steps], axis=2)
         x, y, w = homography @ np.c_[straight - self.centre, np.ones(len(points))].T
-        places = np.stack([x / w, y / w], axis=1)
-        flat = (homography[:2, :2] - places[:, :, None] * homography[2, :2]) / w[:, None, None]
+        plane_points = np.stack([x / w, y / w], axis=1)
+        flat = (homography[:2, :2] - plane_points[:, :, None] * homography[2, :2]) / w[:, None, None]
         return np.asarray(flat @ np.linalg.inv(bent))
 
     def sensitivity(self, points: FloatArray) -> FloatArray:
@@ -222,8 +223,8 @@ class CameraCalibration:
         """Derivative (..., 16) of a function (...) of the parameters, scaled as `sensitivity` states."""
         values = self.parameters
         steps = np.diag(np.sqrt(np.diag(self.covariance)))
-        parts = [(function(values + step) - function(values - step)) / 2 for step in steps]
-        return np.stack(parts, axis=-1)
+        derivatives = [(function(values + step) - function(values - step)) / 2 for step in steps]
+        return np.stack(derivatives, axis=-1)
 
     def in_image_axes(self) -> tuple[Self, FloatArray]:
         """Return the camera with the plane in the axes of the image, and the motion (3, 3) of its points to there.
@@ -243,8 +244,8 @@ class CameraCalibration:
         motion[:2, :2] = [[x, y], [-y, x]]
         motion[1] *= np.sign(np.linalg.det(slope))
         motion[:2, 2] = -replace(self, homography=motion @ homography).to_mm(np.zeros((1, 2)))[0]
-        moved = motion @ homography
-        return replace(self, homography=moved / moved[2, 2]), motion
+        aligned = motion @ homography
+        return replace(self, homography=aligned / aligned[2, 2]), motion
 
     @property
     def correlation(self) -> FloatArray:
@@ -262,9 +263,9 @@ class CameraCalibration:
         """
         if self.lens is None:
             return float("nan"), float("nan")
-        here, slopes = self._slope(self.parameters), self._by_parameters(self._slope)
-        size = float(np.hypot(*here))
-        along = here / size if size > 0 else np.array([1.0, 0.0])
+        slope, slopes = self._slope(self.parameters), self._by_parameters(self._slope)
+        size = float(np.hypot(*slope))
+        along = slope / size if size > 0 else np.array([1.0, 0.0])
         std = np.sqrt(along @ (slopes @ self.correlation @ slopes.T) @ along) / (1 + size**2)
         return float(np.degrees(np.arctan(size))), float(np.degrees(std))
 
@@ -291,9 +292,11 @@ class CameraCalibration:
             In mm per px.
         """
         scale = float(np.sqrt(np.linalg.det(self.jacobian(point[None])[0])))
-        around = point + _SPAN * np.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
-        places, slopes = self.to_mm(around), self.sensitivity(around)
-        (along, across), (d_along, d_across) = ((part[1] - part[0], part[3] - part[2]) for part in (places, slopes))
+        neighbours = point + _SPAN * np.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
+        plane_points, slopes = self.to_mm(neighbours), self.sensitivity(neighbours)
+        (along, across), (d_along, d_across) = (
+            (values[1] - values[0], values[3] - values[2]) for values in (plane_points, slopes)
+        )
         area = along[0] * across[1] - along[1] * across[0]
         slope = d_along[0] * across[1] + along[0] * d_across[1] - (d_along[1] * across[0] + along[1] * d_across[0])
         return scale, float(scale * np.sqrt(slope @ self.correlation @ slope) / (2 * area))
@@ -342,19 +345,19 @@ class CameraCalibration:
                 text = "%s (scale.camera) is of light %s's image; without a registration in calibration.file the "
                 logger.warning(text + "images of all lights are taken to lie on that one", self.name, of_camera)
             return
-        first, *others = registration.lights
+        first, *other_lights = registration.lights
         if of_camera not in (None, first):
             raise CalibrationError(
                 f"{self.name} (scale.camera) is of light {of_camera}'s image, the test measures in px of that of light "
                 f"{first}, the first of calibration.file: calibrate both with the lights in one order"
             )
         (scale, std), magnification = self.scale(self.centre), np.abs(registration.parameters[1:, 3])
-        if of_camera is None and others and magnification.max() > std / scale:
-            other, percent = others[int(magnification.argmax())], 100 * magnification.max()
+        if of_camera is None and other_lights and magnification.max() > std / scale:
+            worst_light, percent = other_lights[int(magnification.argmax())], 100 * magnification.max()
             logger.warning(
-                f"{self.name} (scale.camera) states no light: if its target was photographed under {other}, lengths in "
-                f"mm are {percent:.2g} % off, because px are those of light {first}'s image (rgbmidic-calibrate camera "
-                "--light)"
+                f"{self.name} (scale.camera) states no light: if its target was photographed under {worst_light}, "
+                f"lengths in mm are {percent:.2g} % off, because px are those of light {first}'s image "
+                "(rgbmidic-calibrate camera --light)"
             )
 
     def summary(self) -> str:
@@ -365,13 +368,13 @@ class CameraCalibration:
         str
         """
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
-        known = (
+        tilt_text = (
             f"tilt {format_with_std(tilt, tilt_std, 'degrees')}"
             if np.isfinite(tilt)
             else "tilt not known without a lens"
         )
         light = f" of light {first}'s image" if (first := self.details.get("first_light")) else ""
-        return f"{format_with_std(scale, scale_std, 'mm per px')}{light} in the middle of the frame, {known}"
+        return f"{format_with_std(scale, scale_std, 'mm per px')}{light} in the middle of the frame, {tilt_text}"
 
     def jacobian_std(self, points: FloatArray) -> FloatArray:
         """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.
@@ -395,7 +398,7 @@ class CameraCalibration:
 
     @classmethod
     def is_in(cls, path: Path) -> bool:
-        """Whether a file is one that `read` reads, if not damaged.
+        """Return whether a file is one that `read` reads, if not damaged.
 
         Parameters
         ----------
@@ -495,6 +498,7 @@ class CameraCalibration:
         write_document(path, self.to_document())
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rectification:
     """Change of coordinates from px of the image to rectified px, in which a mm on the plane has one length everywhere.
@@ -548,22 +552,22 @@ class Rectification:
         if camera is None:
             units = Units(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std)
             return cls(camera=None, image=mesh, mesh=mesh, units=units)
-        places = camera.to_mm(mesh.nodes)
-        if not np.isfinite(places).all():
+        plane_points = camera.to_mm(mesh.nodes)
+        if not np.isfinite(plane_points).all():
             raise InputError(f"the lens of {camera.name} does not image all of the mesh: its distortion has no inverse")
-        size = Tri3Mesh(nodes=places, elements=mesh.elements).size / mesh.size
-        some = mesh.nodes[:: len(mesh.nodes) // 200 + 1]  # the uncertainty is a polynomial of low degree
-        std = float(np.sqrt(np.mean(camera.jacobian_std(some) ** 2)))
-        flat = Tri3Mesh(nodes=places / size, elements=mesh.elements)
+        size = Tri3Mesh(nodes=plane_points, elements=mesh.elements).size / mesh.size
+        sampled_nodes = mesh.nodes[:: len(mesh.nodes) // 200 + 1]  # the uncertainty is a polynomial of low degree
+        std = float(np.sqrt(np.mean(camera.jacobian_std(sampled_nodes) ** 2)))
+        flat = Tri3Mesh(nodes=plane_points / size, elements=mesh.elements)
         units = Units(mm_per_pixel=size, mm_per_pixel_std=std)
         return cls(camera=camera, image=mesh, mesh=flat, units=units)
 
-    def place(self, place: Sequence[float], points: int) -> tuple[float, ...]:
+    def probe_coordinates(self, coordinates: Sequence[float], points: int) -> tuple[float, ...]:
         """Rectify the numbers that place a probe: so many points (x, y) one after the other, then lengths.
 
         Parameters
         ----------
-        place
+        coordinates
             Numbers in px of the image.
         points
             Number of points that they begin with.
@@ -574,9 +578,9 @@ class Rectification:
             In rectified px.
         """
         if self.camera is None or self.units.mm_per_pixel is None:
-            return tuple(map(float, place))
-        ends = np.array(place[: 2 * points], dtype=np.float64).reshape(-1, 2)
-        return (*(self.camera.to_mm(ends) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * points :])
+            return tuple(map(float, coordinates))
+        ends = np.array(coordinates[: 2 * points], dtype=np.float64).reshape(-1, 2)
+        return (*(self.camera.to_mm(ends) / self.units.mm_per_pixel).ravel().tolist(), *coordinates[2 * points :])
 
     def displacement(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, ...]:
         """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN.
@@ -595,8 +599,8 @@ class Rectification:
         """
         if self.camera is None or self.units.mm_per_pixel is None:
             return u, v, *std
-        moved = self.image.nodes + np.stack([u, v], axis=1)
-        along = self.camera.to_mm(moved) / self.units.mm_per_pixel - self.mesh.nodes
-        slopes = self.camera.jacobian(moved) / self.units.mm_per_pixel
+        deformed = self.image.nodes + np.stack([u, v], axis=1)
+        along = self.camera.to_mm(deformed) / self.units.mm_per_pixel - self.mesh.nodes
+        slopes = self.camera.jacobian(deformed) / self.units.mm_per_pixel
         square = np.square(std, dtype=np.float64).reshape(-1, 2, len(u))
         return *along.T, *np.sqrt(np.einsum("nij,sjn->sin", slopes**2, square)).reshape(-1, len(u))

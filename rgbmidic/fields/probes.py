@@ -19,11 +19,12 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.interpolation import Places, PointSum
+from rgbmidic.fields.interpolation import MeshPoints, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -34,9 +35,9 @@ class ProbeConstants:
 
     Attributes
     ----------
-    least
+    min_fraction
         Least part of an area that must be measured for its mean to be stated: the larger part represents the whole.
-    whole
+    complete_fraction
         Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen.
     rounding
         Of a sum of weights.
@@ -47,8 +48,8 @@ class ProbeConstants:
         Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40.
     """
 
-    least: float = 0.5
-    whole: float = 0.995
+    min_fraction: float = 0.5
+    complete_fraction: float = 0.995
     rounding: float = 1e-9
     edge: float = 0.05
     step: float = 1.0
@@ -57,6 +58,7 @@ class ProbeConstants:
 _CONSTANTS = ProbeConstants()
 
 
+@state_new_names
 @dataclass(kw_only=True, eq=False)
 class Mean:
     """Displacement at a point, or its mean along a line or over an area: u and v.
@@ -69,14 +71,14 @@ class Mean:
         Over points that stand for the place.
     covariance
         Of the nodes' errors.
-    least
+    min_fraction
         Part of the points in the region that must be measured; the mean is that of the measured part.
     """
 
     name: str
     sum: PointSum
     covariance: NodalCovariance
-    least: float = 1.0
+    min_fraction: float = 1.0
 
     @classmethod
     def over(
@@ -84,7 +86,7 @@ class Mean:
         covariance: NodalCovariance,
         name: str,
         points: npt.ArrayLike,
-        least: float = 1.0,
+        min_fraction: float = 1.0,
         factors: npt.ArrayLike | None = None,
     ) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
@@ -97,7 +99,7 @@ class Mean:
             Name of the probe.
         points : array_like, shape (P, 2)
             Points (x, y) on the reference, px.
-        least
+        min_fraction
             Fraction of the points that must have data in a frame.
         factors : array_like, shape (P,), optional
             Of the points; None: equal ones, whose sum is 1.
@@ -111,11 +113,11 @@ class Mean:
         InputError
             A point is outside the region.
         """
-        places = Places.of(covariance.mesh, points)
-        places.check(name)
-        equal = np.full(len(places.points), 1 / len(places.points))
-        points_sum = PointSum.over(places, equal if factors is None else np.asarray(factors, dtype=np.float64))
-        return cls(name=name, sum=points_sum, covariance=covariance.part(points_sum.nodes), least=least)
+        mesh_points = MeshPoints.of(covariance.mesh, points)
+        mesh_points.check(name)
+        equal = np.full(len(mesh_points.points), 1 / len(mesh_points.points))
+        points_sum = PointSum.over(mesh_points, equal if factors is None else np.asarray(factors, dtype=np.float64))
+        return cls(name=name, sum=points_sum, covariance=covariance.subset(points_sum.nodes), min_fraction=min_fraction)
 
     @property
     def nodes(self) -> IntArray:
@@ -134,12 +136,12 @@ class Mean:
         -------
         list of History
         """
-        weights, measured = self.weights(_known(nodal))
-        return self._moved(nodal, weights[:, 0], measured)
+        weights, measured = self.weights(_has_data(nodal))
+        return self._displacement_histories(nodal, weights[:, 0], measured)
 
-    def _moved(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
+    def _displacement_histories(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
         u, v = (self.average(weights, *component) for component in nodal.components)
-        note = _cut(self.name, "mean", self.sum.inside * measured)
+        note = _coverage_note(self.name, "mean", self.sum.inside * measured)
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
     def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, FloatArray]:
@@ -164,7 +166,7 @@ class Mean:
         weights, measured = np.full(shape, np.nan), np.ones(len(patterns))
         for row, pattern in enumerate(patterns):
             sums, fraction = self.sum.weights(pattern, linear=linear)
-            if fraction >= self.least - _CONSTANTS.rounding:
+            if fraction >= self.min_fraction - _CONSTANTS.rounding:
                 weights[row], measured[row] = sums / fraction, fraction
         return weights[frame.ravel()], measured[frame.ravel()]
 
@@ -200,16 +202,19 @@ def _products(weights: FloatArray, values: FloatArray) -> FloatArray:
     return np.multiply(weights, values, out=np.zeros(weights.shape), where=weights != 0)
 
 
-def _known(nodal: Nodal) -> BoolArray:
+def _has_data(nodal: Nodal) -> BoolArray:
     return np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
 
 
-def _cut(name: str, what: str, used: FloatArray) -> str:
-    """What is said of a probe of which only a part (T,) is `used`, where it reaches beyond what is measured."""
-    least = float(used.min(initial=1.0))
-    if least > _CONSTANTS.whole:
+def _coverage_note(name: str, quantity: str, coverage: FloatArray) -> str:
+    """Return a note on a probe whose `coverage` (T,) by measured points is not complete in all frames."""
+    min_coverage = float(coverage.min(initial=1.0))
+    if min_coverage > _CONSTANTS.complete_fraction:
         return ""
-    return f"{name} is the {what} of {least:.0%} of its place at least: the rest lies outside the region or has no data"
+    return (
+        f"{name} is the {quantity} of {min_coverage:.0%} of its place at least: the rest lies outside the region "
+        "or has no data"
+    )
 
 
 def _line(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
@@ -256,19 +261,23 @@ class Gauge:
         self.name, self.moving, self.arm = name, moving, ends[1] - ends[0]
         if not np.hypot(*self.arm) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
-        self._apart = Mean.over(covariance, name, ends, factors=(-1, 1))
-        self.nodes = self._apart.nodes
+        self._relative = Mean.over(covariance, name, ends, factors=(-1, 1))
+        self.nodes = self._relative.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length, weights = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))[0][:, 0]
-        apart, spread = np.stack([self._apart.average(weights, *one) for one in nodal.components], axis=2)
-        now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
-        towards = now / np.hypot(*now.T)[:, None]
-        extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
+        length, weights = float(np.hypot(*self.arm)), self._relative.weights(_has_data(nodal))[0][:, 0]
+        relative_displacement, spread = np.stack(
+            [self._relative.average(weights, *component) for component in nodal.components], axis=2
+        )
+        deformed_arm = (
+            self.arm + relative_displacement if self.moving else np.broadcast_to(self.arm, relative_displacement.shape)
+        )
+        towards = deformed_arm / np.hypot(*deformed_arm.T)[:, None]
+        extension = np.hypot(*deformed_arm.T) - length if self.moving else (towards * relative_displacement).sum(axis=1)
         std = np.hypot(*(towards * spread).T)
-        parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
-        return histories_of(self.name, parts)
+        quantities = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
+        return histories_of(self.name, quantities)
 
 
 class StrainGauge:
@@ -298,24 +307,24 @@ class StrainGauge:
     ) -> None:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
-        self.gauges, self.covariance = gauges.of_nodes(self.nodes), covariance.part(self.nodes)
-        places = Places.of(covariance.mesh, _circle(x, y, gauges.length / 2))
-        self.inside = float(places.inside.mean())
-        if self.inside < _CONSTANTS.least - _CONSTANTS.edge:
-            raise InputError(f"half or more of {name} is outside {places.where}")
+        self.gauges, self.covariance = gauges.of_nodes(self.nodes), covariance.subset(self.nodes)
+        mesh_points = MeshPoints.of(covariance.mesh, _circle(x, y, gauges.length / 2))
+        self.inside = float(mesh_points.inside.mean())
+        if self.inside < _CONSTANTS.min_fraction - _CONSTANTS.edge:
+            raise InputError(f"half or more of {name} is outside {mesh_points.bounds_text}")
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame.
 
         They are NaN where less than half of the nodes, as they count, is measured.
         """
-        patterns, frame = np.unique(known := _known(nodal), axis=0, return_inverse=True)
+        patterns, frame = np.unique(has_data := _has_data(nodal), axis=0, return_inverse=True)
         slopes = np.stack([self.gauges.weights(pattern) for pattern in patterns])[frame.ravel()]
-        used = known[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
-        slopes[used < _CONSTANTS.least - _CONSTANTS.rounding] = np.nan
+        measured_fraction = has_data[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
+        slopes[measured_fraction < _CONSTANTS.min_fraction - _CONSTANTS.rounding] = np.nan
         strain = _strain(slopes, nodal, self.covariance, self.measure)
-        kept = np.where(np.isfinite(strain.components[:, 0]), used, 1.0)
-        return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * kept))
+        coverage = np.where(np.isfinite(strain.components[:, 0]), measured_fraction, 1.0)
+        return _strain_histories(self.name, strain, _coverage_note(self.name, "strain", self.inside * coverage))
 
 
 def _strain(slopes: FloatArray, nodal: Nodal, covariance: NodalCovariance, measure: str) -> Strain:
@@ -323,8 +332,8 @@ def _strain(slopes: FloatArray, nodal: Nodal, covariance: NodalCovariance, measu
     gradient, spread = np.zeros((len(slopes), 2, 2)), np.zeros((len(slopes), 4, 4))
     for row, (value, std, bias) in enumerate(nodal.components[:, :, :, None]):
         gradient[:, row] = _products(slopes, value).sum(axis=2)
-        errors, own = covariance.errors(slopes, std, bias), slice(2 * row, 2 * row + 2)
-        spread[:, own, own] = errors @ errors.swapaxes(1, 2)
+        errors, block = covariance.errors(slopes, std, bias), slice(2 * row, 2 * row + 2)
+        spread[:, block, block] = errors @ errors.swapaxes(1, 2)
     return strain_of_gradient(gradient, spread, measure)
 
 
@@ -360,11 +369,13 @@ class Area(Mean):
     """
 
     def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
-        places = Places.of(covariance.mesh, points)
-        if places.inside.mean() < _CONSTANTS.least:
-            raise InputError(f"half or more of {name} is outside {places.where}")
-        area = PointSum.over(places, places.inside / places.inside.sum(), slopes=True)
-        super().__init__(name=name, sum=area, covariance=covariance.part(area.nodes), least=_CONSTANTS.least)
+        mesh_points = MeshPoints.of(covariance.mesh, points)
+        if mesh_points.inside.mean() < _CONSTANTS.min_fraction:
+            raise InputError(f"half or more of {name} is outside {mesh_points.bounds_text}")
+        area = PointSum.over(mesh_points, mesh_points.inside / mesh_points.inside.sum(), slopes=True)
+        super().__init__(
+            name=name, sum=area, covariance=covariance.subset(area.nodes), min_fraction=_CONSTANTS.min_fraction
+        )
         self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -379,15 +390,15 @@ class Area(Mean):
         -------
         list of History
         """
-        weights, measured = self.weights(_known(nodal))
-        moved = self._moved(nodal, weights[:, 0], measured)
+        weights, measured = self.weights(_has_data(nodal))
+        displacements = self._displacement_histories(nodal, weights[:, 0], measured)
         strain = _strain(weights[:, 1:], nodal, self.covariance, self.measure)
-        return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
+        return [*displacements, *_strain_histories(self.name, strain, displacements[0].note)]
 
 
 PROBES: dict[str, tuple[int, int, Callable[..., Probe]]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
-    "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.least)),
+    "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.min_fraction)),
     "circle": (1, 1, lambda c, name, *place, **more: Area(c, name, _circle(*place), **more)),
     "region": (2, 0, lambda c, name, *place, **more: Area(c, name, _rectangle(*place), **more)),
     "gauge": (2, 0, Gauge),
@@ -407,7 +418,7 @@ def make_probe(
     covariance: NodalCovariance,
     kind: str,
     number: int,
-    place: Sequence[float],
+    coordinates: Sequence[float],
     settings: ProbeSettings | None = None,
     rectified: Rectification | None = None,
 ) -> Probe:
@@ -421,7 +432,7 @@ def make_probe(
         One of `PROBES`.
     number
         Counted from 1 within the kind.
-    place
+    coordinates
         The numbers of `PROBES`, px of the image.
     settings
         Strain measure of a strain gauge; material and fit of a crack's tip; names. None: the defaults.
@@ -439,15 +450,19 @@ def make_probe(
     """
     (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
-    if len(place) != 2 * points + lengths:
-        raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
+    if len(coordinates) != 2 * points + lengths:
+        raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(coordinates)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}
     if kind == "tip":
-        stated: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
-        more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **stated)
-    placed = np.asarray(place if rectified is None else rectified.place(place, points), dtype=np.float64)
+        tip_settings: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
+        more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **tip_settings)
+    rectified_coordinates = np.asarray(
+        coordinates if rectified is None else rectified.probe_coordinates(coordinates, points), dtype=np.float64
+    )
     nodes = covariance.mesh.nodes
-    if not (np.abs(placed) <= np.abs(nodes).max() + 2 * np.ptp(nodes, axis=0).max()).all():  # too far to be sampled
-        where = Places.of(covariance.mesh, nodes[:1]).where
-        raise InputError(f"half or more of {name} is outside {where}; given is {list(place)}")
-    return make(covariance, name, *placed.tolist(), **more)
+    if not (
+        np.abs(rectified_coordinates) <= np.abs(nodes).max() + 2 * np.ptp(nodes, axis=0).max()
+    ).all():  # too far to be sampled
+        bounds_text = MeshPoints.of(covariance.mesh, nodes[:1]).bounds_text
+        raise InputError(f"half or more of {name} is outside {bounds_text}; given is {list(coordinates)}")
+    return make(covariance, name, *rectified_coordinates.tolist(), **more)

@@ -21,9 +21,10 @@ import scipy.sparse as sp
 from scipy.special import chdtrc
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.strain import StrainGauges
+from rgbmidic.renamed import state_new_names
 from rgbmidic.text import format_with_std
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -37,7 +38,7 @@ class ProfileConstants:
 
     Attributes
     ----------
-    least
+    min_inside_fraction
         Least part of a line that must be inside the region: the larger part represents the whole, as of a
         probe's.
     step
@@ -76,7 +77,7 @@ class ProfileConstants:
         Positions that a fit needs: two parameters, and two more to see whether they describe anything.
     """
 
-    least: float = 0.5
+    min_inside_fraction: float = 0.5
     step: float = 0.382
     lopsided: float = 0.1
     clear: float = 5.0
@@ -99,10 +100,11 @@ _WIDTHS = {"front": 1.5, "peak": 3.0}
 maximum."""
 
 
+@state_new_names
 class ProfileLine:
     """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
-    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of their
+    A value is that of the field between the nodes (`MeshPoints`); its uncertainty follows from the correlation of their
     errors.
 
     Parameters
@@ -122,9 +124,9 @@ class ProfileLine:
         Distance from the first end, px.
     nodes : ndarray, shape (n,), int
         Nodes around the line.
-    places
+    mesh_points
         The points in the part of the mesh that has these nodes.
-    even : ndarray, shape (P,), bool
+    is_two_sided : ndarray, shape (P,), bool
         Where the strain gauges around extend to both sides along the line: at an edge their strain is that of a place
         further inside.
     covariances
@@ -143,25 +145,29 @@ class ProfileLine:
         mesh, length = covariance.mesh, math.hypot(x1 - x0, y1 - y0)
         if not length > 0:
             raise InputError(f"a line needs two different points, not ({x0:g}, {y0:g}) twice")
-        longest = float(np.hypot(*np.ptp(mesh.nodes, axis=0))) / _CONSTANTS.least  # of which so much can be inside
+        # the longest line of which so much can be inside
+        longest = float(np.hypot(*np.ptp(mesh.nodes, axis=0))) / _CONSTANTS.min_inside_fraction
         steps = max(math.ceil(min(length, longest) / (_CONSTANTS.step * mesh.size)), 1)
         points = np.linspace((x0, y0), (x1, y1), steps + 1)
-        if not length <= longest or (places := Places.of(mesh, points)).inside.mean() < _CONSTANTS.least:
+        if (
+            not length <= longest
+            or (mesh_points := MeshPoints.of(mesh, points)).inside.mean() < _CONSTANTS.min_inside_fraction
+        ):
             raise InputError(
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside "
-                f"{Places.of(mesh, mesh.nodes[:1]).where}"
+                f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
-        self.nodes, self.places = places.nearby()
+        self.nodes, self.mesh_points = mesh_points.nearby()
         nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
-        both = covariance.relative([slope[nodes] for slope in gauges.slopes])
-        self.covariances = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": both}
+        strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
+        self.covariances = {"": covariance.subset(nodes), "exx": exx, "eyy": eyy, "strain": strain_covariance}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
-        at_corners = lopsided[mesh.elements[places.element]]
-        self.even = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
+        at_corners = lopsided[mesh.elements[mesh_points.element]]
+        self.is_two_sided = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
 
     def read(
         self, values: FloatArray, std: FloatArray, kind: str = "", bias: FloatArray | float = 0.0
@@ -182,11 +188,11 @@ class ProfileLine:
         values, std : ndarray, shape (P,)
             NaN where a node around is not measured.
         """
-        values, std, bias = (part[self.nodes] for part in np.broadcast_arrays(values, std, bias))
+        values, std, bias = (array[self.nodes] for array in np.broadcast_arrays(values, std, bias))
         weights = _weights(self, np.isfinite(values).tobytes())
-        found = weights @ np.nan_to_num(values)
+        interpolated = weights @ np.nan_to_num(values)
         variance = self.covariances[kind].variance(np.nan_to_num(weights), std, bias)
-        return found, np.where(np.isfinite(found), np.sqrt(variance), np.nan)
+        return interpolated, np.where(np.isfinite(interpolated), np.sqrt(variance), np.nan)
 
     def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.
@@ -211,8 +217,8 @@ class ProfileLine:
 def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
     """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
     has_data = np.frombuffer(measured, dtype=bool)
-    weights = line.places.weights(has_data).toarray()
-    weights[~line.places.measured(has_data)] = np.nan
+    weights = line.mesh_points.weights(has_data).toarray()
+    weights[~line.mesh_points.measured(has_data)] = np.nan
     return np.asarray(weights)
 
 
@@ -229,16 +235,16 @@ def rate_correlation(times: FloatArray, window: float) -> FloatArray:
     That of two slopes of parabolas around their frames in independent noise, ``sum(h h') / sum(h^2)`` with h the
     distance in time from the middle. That of `rates`, which has further degrees, is taken as the same.
     """
-    away = times[None] - times[:, None]
-    inside = np.abs(away) <= 0.5 * window * (1 + 1e-6)
-    away = np.where(inside, away - (away * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1)[:, None], 0.0)
-    scale = 1 / np.sqrt(np.maximum((away**2).sum(axis=1), np.finfo(float).tiny))
-    return np.asarray((away @ away.T) * scale * scale[:, None])
+    lag = times[None] - times[:, None]
+    inside = np.abs(lag) <= 0.5 * window * (1 + 1e-6)
+    lag = np.where(inside, lag - (lag * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1)[:, None], 0.0)
+    scale = 1 / np.sqrt(np.maximum((lag**2).sum(axis=1), np.finfo(float).tiny))
+    return np.asarray((lag @ lag.T) * scale * scale[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arrivals:
-    """When a front or peak arrives at each position.
+    """Times at which a front or peak arrives at each position.
 
     Attributes
     ----------
@@ -265,7 +271,7 @@ def arrival_times(
     values: npt.ArrayLike,
     std: npt.ArrayLike,
     *,
-    what: str = ARRIVALS[0],
+    feature: str = ARRIVALS[0],
     level: float | str = "50%",
     common_fraction: float = 0.5,
     between_frames: FloatArray | None = None,
@@ -282,7 +288,7 @@ def arrival_times(
         Of the frames, rising.
     values, std : (T, P)
         At each position, with their standard uncertainty; NaN where not measured.
-    what
+    feature
         One of `ARRIVALS`.
     level
         Value at which the front is taken, or with a percent sign the fraction of the peak.
@@ -300,41 +306,42 @@ def arrival_times(
     Raises
     ------
     InputError
-        `what` or `level` is none of those allowed, or there are fewer than 6 frames.
+        `feature` or `level` is none of those allowed, or there are fewer than 6 frames.
     """
     value, fraction = read_level(level)
-    if what not in ARRIVALS:
-        raise InputError(f"what arrives is {' or '.join(ARRIVALS)}, not {what!r}")
-    when, y, spread = (np.asarray(part, dtype=np.float64) for part in (times, values, std))
-    if len(when) < 6 or not (np.diff(when) > 0).all():
-        raise InputError(f"arrival times need 6 frames or more whose times rise; there are {len(when)}")
-    interval = float(np.median(np.diff(when)))
-    known = np.isfinite(y) & np.isfinite(spread)
-    size = np.where(known, y / np.where(spread > 0, spread, np.inf), 0.0)
+    if feature not in ARRIVALS:
+        raise InputError(f"what arrives is {' or '.join(ARRIVALS)}, not {feature!r}")
+    frame_times, y, spread = (np.asarray(array, dtype=np.float64) for array in (times, values, std))
+    if len(frame_times) < 6 or not (np.diff(frame_times) > 0).all():
+        raise InputError(f"arrival times need 6 frames or more whose times rise; there are {len(frame_times)}")
+    interval = float(np.median(np.diff(frame_times)))
+    is_measured = np.isfinite(y) & np.isfinite(spread)
+    size = np.where(is_measured, y / np.where(spread > 0, spread, np.inf), 0.0)
     signs = np.where(np.abs(size).max(axis=0) > 0, np.sign(size[np.abs(size).argmax(axis=0), np.arange(y.shape[1])]), 0)
     sign = math.copysign(1.0, value or signs.sum() or 1.0)
     series = sign * y
-    first = _Smooth(when, _CONSTANTS.smoothest * interval)
+    first = _Smooth(frame_times, _CONSTANTS.smoothest * interval)
     clear = np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
     height = 2 * abs(value) or math.inf  # around a value, as around half of a peak
-    rises = np.array([first.rise(series[:, p], known[:, p], height) for p in clear])
+    rises = np.array([first.rise(series[:, p], is_measured[:, p], height) for p in clear])
     rise = float(np.median(rises[np.isfinite(rises)])) if np.isfinite(rises).any() else 0.0
-    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise))
-    found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
-    own = np.eye(len(when)) if between_frames is None else between_frames
-    step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
+    smooth = _Smooth(frame_times, max(_CONSTANTS.smoothest * interval, _WIDTHS[feature] * rise))
+    arrivals, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
+    noise_correlation = np.eye(len(frame_times)) if between_frames is None else between_frames
+    step = first.rise((frame_times > frame_times[len(frame_times) // 2]) * 1.0, np.ones(len(frame_times), dtype=bool))
     abrupt, cut = 0 < rise < _CONSTANTS.abrupt * step, np.zeros(y.shape[1], dtype=bool)
     for p in range(y.shape[1]):
         at, is_rising = smooth.arrival(
-            series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, (sign * value, fraction)
+            series[:, p], np.where(is_measured[:, p], spread[:, p], np.nan), feature, (sign * value, fraction)
         )
         cut[p] = is_rising and at is None
         if at is not None:
-            found[p], weights[p] = at
-            parts = weights[p] * np.nan_to_num(spread[:, p])
-            noise = (1 - common_fraction) * parts @ own @ parts + common_fraction * parts.sum() ** 2
+            arrivals[p], weights[p] = at
+            weighted_std = weights[p] * np.nan_to_num(spread[:, p])
+            noise = (1 - common_fraction) * weighted_std @ noise_correlation @ weighted_std
+            noise += common_fraction * weighted_std.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
-    return Arrivals(times=found, std=errors, weights=sign * weights, abrupt=abrupt, cut=cut)
+    return Arrivals(times=arrivals, std=errors, weights=sign * weights, abrupt=abrupt, cut=cut)
 
 
 def read_level(level: float | str) -> tuple[float, float]:
@@ -383,37 +390,39 @@ class _Smooth:
     def __init__(self, times: FloatArray, half: float) -> None:
         self.times, self.half = times, half
         steps = [np.linspace(a, b, _CONSTANTS.fine, endpoint=False) for a, b in pairwise(times)]
-        self.places = np.append(np.concatenate(steps), times[-1])
-        self._kept: dict[bytes, sp.csr_matrix] = {}
+        self.grid = np.append(np.concatenate(steps), times[-1])
+        self._operators: dict[bytes, sp.csr_matrix] = {}
 
-    def operator(self, known: BoolArray) -> sp.csr_matrix:
+    def operator(self, is_measured: BoolArray) -> sp.csr_matrix:
         """Return the weight (G, T) of every frame in the curve at each place; NaN where too few frames are known."""
-        if (key := known.tobytes()) not in self._kept:
-            parts = np.array_split(self.places, math.ceil(len(self.places) / _CONSTANTS.rows))
-            self._kept[key] = sp.csr_matrix(sp.vstack([sp.csr_matrix(self._rows(part, known)) for part in parts]))
-        return self._kept[key]
+        if (key := is_measured.tobytes()) not in self._operators:
+            batches = np.array_split(self.grid, math.ceil(len(self.grid) / _CONSTANTS.rows))
+            self._operators[key] = sp.csr_matrix(
+                sp.vstack([sp.csr_matrix(self._rows(batch, is_measured)) for batch in batches])
+            )
+        return self._operators[key]
 
-    def _rows(self, places: FloatArray, known: BoolArray) -> FloatArray:
-        away = (self.times[None] - places[:, None]) / self.half
-        w = np.clip(1 - np.abs(away) ** 3, 0, None) ** 3 * known
-        powers = np.stack([np.ones_like(away), away, away**2], axis=1)
+    def _rows(self, points: FloatArray, is_measured: BoolArray) -> FloatArray:
+        offset = (self.times[None] - points[:, None]) / self.half
+        w = np.clip(1 - np.abs(offset) ** 3, 0, None) ** 3 * is_measured
+        powers = np.stack([np.ones_like(offset), offset, offset**2], axis=1)
         normal = np.einsum("gt,git,gjt->gij", w, powers, powers, optimize=True)
         enough = np.linalg.det(normal) > _CONSTANTS.determined * normal[:, 0, 0] ** 3
         normal[~enough] = np.nan
-        first = np.full((len(places), 3), np.nan)
+        first = np.full((len(points), 3), np.nan)
         first[enough] = np.linalg.inv(normal[enough])[:, 0]
         return np.asarray(w * np.einsum("gi,git->gt", first, powers))
 
-    def rise(self, series: FloatArray, known: BoolArray, height: float = math.inf) -> float:
+    def rise(self, series: FloatArray, is_measured: BoolArray, height: float = math.inf) -> float:
         """Return how long a series rises between the `_CONSTANTS.rise` fractions of its peak, or of a lower `height`.
 
         NaN where it does not.
         """
-        curve = self.operator(known) @ np.where(known, series, 0.0)
+        curve = self.operator(is_measured) @ np.where(is_measured, series, 0.0)
         if not np.isfinite(curve).any():
             return math.nan
         top = int(np.nanargmax(curve))
-        low, high = (self._crossing(curve, top, part * min(curve[top], height)) for part in _CONSTANTS.rise)
+        low, high = (self._crossing(curve, top, fraction * min(curve[top], height)) for fraction in _CONSTANTS.rise)
         return high - low
 
     def _crossing(self, curve: FloatArray, top: int, level: float) -> float:
@@ -422,11 +431,11 @@ class _Smooth:
         if not len(below) or not np.isfinite(curve[below[-1]]):
             return math.nan
         i = below[-1]
-        part = (level - curve[i]) / (curve[i + 1] - curve[i])
-        return float(self.places[i] + part * (self.places[i + 1] - self.places[i]))
+        fraction = (level - curve[i]) / (curve[i + 1] - curve[i])
+        return float(self.grid[i] + fraction * (self.grid[i + 1] - self.grid[i]))
 
     def arrival(
-        self, series: FloatArray, std: FloatArray, what: str, level: tuple[float, float]
+        self, series: FloatArray, std: FloatArray, feature: str, level: tuple[float, float]
     ) -> tuple[tuple[float, FloatArray] | None, bool]:
         """Find the arrival in a series (T,).
 
@@ -437,33 +446,33 @@ class _Smooth:
         is_rising
             Whether the series still rises above all before in the last frames, by more than its noise.
         """
-        known, (value, fraction) = np.isfinite(std), level
-        operator = self.operator(known)
-        values = np.where(known, series, 0.0)
+        is_measured, (value, fraction) = np.isfinite(std), level
+        operator = self.operator(is_measured)
+        values = np.where(is_measured, series, 0.0)
         curve = operator @ values
         if not np.isfinite(curve).any():
             return None, False
         top = int(np.nanargmax(curve))
         highest = operator[top].toarray().ravel()
         clear = _CONSTANTS.clear * float(np.linalg.norm(highest * np.nan_to_num(std)))
-        before = np.where(self.places <= self.times[-1] - self.half, np.nan_to_num(curve), 0.0).max()
+        before = np.where(self.grid <= self.times[-1] - self.half, np.nan_to_num(curve), 0.0).max()
         is_rising = curve[top] - before > clear
-        if not curve[top] > clear or top == 0 or (what == "peak" and top == len(curve) - 1):
+        if not curve[top] > clear or top == 0 or (feature == "peak" and top == len(curve) - 1):
             return None, False
-        step = (self.places[-1] - self.places[0]) / (len(self.places) - 1)
-        if what == "peak":
-            at = float(self.places[top])
+        step = (self.grid[-1] - self.grid[0]) / (len(self.grid) - 1)
+        if feature == "peak":
+            at = float(self.grid[top])
             for _ in range(3):  # Newton's steps from the best of the places
-                rows = self._rows(np.array([at - step, at, at + step]), known)
-                slope, bend = (rows[2] - rows[0]) / (2 * step), (rows[2] - 2 * rows[1] + rows[0]) / step**2
-                if not bend @ values < 0:
+                rows = self._rows(np.array([at - step, at, at + step]), is_measured)
+                slope, curvature = (rows[2] - rows[0]) / (2 * step), (rows[2] - 2 * rows[1] + rows[0]) / step**2
+                if not curvature @ values < 0:
                     return None, is_rising
-                at = min(max(at - float(slope @ values) / float(bend @ values), self.times[0]), self.times[-1])
-            return (at, -slope / float(bend @ values)), is_rising
+                at = min(max(at - float(slope @ values) / float(curvature @ values), self.times[0]), self.times[-1])
+            return (at, -slope / float(curvature @ values)), is_rising
         at = self._crossing(curve, top, value + fraction * curve[top])
         if (is_rising and fraction) or curve[top] < value or not math.isfinite(at):
             return None, is_rising
-        rows = self._rows(np.array([at - step, at, at + step]), known)
+        rows = self._rows(np.array([at - step, at, at + step]), is_measured)
         slope = float((rows[2] - rows[0]) @ values) / (2 * step)
         return ((at, (fraction * highest - rows[1]) / slope) if slope > 0 else None), is_rising
 
@@ -479,12 +488,12 @@ class Front:
         that over the material, on the reference.
     start, start_std
         When it is at position 0.
-    used : ndarray, shape (P,), bool
+    is_fitted : ndarray, shape (P,), bool
         Positions that the fit takes in, so far apart that their noise is little correlated.
     residuals : ndarray, shape (P,)
         Arrival times less the line; NaN where nothing arrives.
     chi_square, freedom
-        Weighted sum of the squared residuals of `used`, and how many degrees of freedom it has.
+        Weighted sum of the squared residuals of `is_fitted`, and how many degrees of freedom it has.
     probability
         That noise alone gives as large a chi-square. Where this exceeds the degrees of freedom the uncertainties are
         those of the noise times ``sqrt(chi_square / freedom)`` (Birge, Phys Rev 40, 1932).
@@ -494,15 +503,15 @@ class Front:
     speed_std: float
     start: float
     start_std: float
-    used: BoolArray
+    is_fitted: BoolArray
     residuals: FloatArray
     chi_square: float
     freedom: int
     probability: float
 
     @property
-    def straight(self) -> bool:
-        """Whether the arrival times lie on a line within their uncertainty."""
+    def is_straight(self) -> bool:
+        """Return whether the arrival times lie on a line within their uncertainty."""
         return self.probability >= _CONSTANTS.doubtful
 
 
@@ -529,7 +538,7 @@ def fit_front(
     correlation : ndarray, shape (P, P)
         Of the noise between positions.
     usable : ndarray, shape (P,), bool, optional
-        Positions that may count, `ProfileLine.even`; None: all.
+        Positions that may count, `ProfileLine.is_two_sided`; None: all.
     common_fraction, between_frames
         As `arrival_times`.
 
@@ -539,34 +548,39 @@ def fit_front(
         Something arrives at fewer than four positions that are far enough apart, or at all of them at once: no front
         travels along the line.
     """
-    there, used = np.flatnonzero(np.isfinite(arrivals.times) & (True if usable is None else usable)), list[int]()
-    for p in there:
-        if not used or abs(correlation[p, used[-1]]) <= _CONSTANTS.independent:
-            used.append(int(p))
-    if len(used) < _CONSTANTS.fewest:
+    arrival_indices = np.flatnonzero(np.isfinite(arrivals.times) & (True if usable is None else usable))
+    fitted = list[int]()
+    for p in arrival_indices:
+        if not fitted or abs(correlation[p, fitted[-1]]) <= _CONSTANTS.independent:
+            fitted.append(int(p))
+    if len(fitted) < _CONSTANTS.fewest:
         cut = int(arrivals.cut.sum())
         rising = f"; at {cut} positions the field still rises in the last of them: take a value, not a part of the peak"
         raise InputError(
-            f"no front: something arrives at {len(there)} of {len(positions)} positions, {len(used)} of them far "
-            f"enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
+            f"no front: something arrives at {len(arrival_indices)} of {len(positions)} positions, {len(fitted)} of "
+            f"them far enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
             f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames{rising if cut else ''}"
         )
-    parts = arrivals.weights[used] * np.nan_to_num(std.T[used])
-    own = parts @ parts.T if between_frames is None else parts @ between_frames @ parts.T
-    sums = parts.sum(axis=1)
-    cover = correlation[np.ix_(used, used)] * ((1 - common_fraction) * own + common_fraction * np.outer(sums, sums))
-    cover += np.diag(np.maximum(arrivals.std[used] ** 2 - np.diag(cover), 0))  # what is not noise, between two frames
-    design = np.stack([np.ones(len(used)), positions[used]], axis=1)
+    weighted_std = arrivals.weights[fitted] * np.nan_to_num(std.T[fitted])
+    noise_covariance = (
+        weighted_std @ weighted_std.T if between_frames is None else weighted_std @ between_frames @ weighted_std.T
+    )
+    sums = weighted_std.sum(axis=1)
+    cover = correlation[np.ix_(fitted, fitted)] * (
+        (1 - common_fraction) * noise_covariance + common_fraction * np.outer(sums, sums)
+    )
+    cover += np.diag(np.maximum(arrivals.std[fitted] ** 2 - np.diag(cover), 0))  # what is not noise, between two frames
+    design = np.stack([np.ones(len(fitted)), positions[fitted]], axis=1)
     weighted = np.linalg.solve(cover, design)
     spread = np.linalg.inv(design.T @ weighted)
-    start, slope = spread @ (weighted.T @ arrivals.times[used])
+    start, slope = spread @ (weighted.T @ arrivals.times[fitted])
     residuals = arrivals.times - start - slope * positions
-    chi_square, freedom = float(residuals[used] @ np.linalg.solve(cover, residuals[used])), len(used) - 2
+    chi_square, freedom = float(residuals[fitted] @ np.linalg.solve(cover, residuals[fitted])), len(fitted) - 2
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)
     start_std, slope_std = np.sqrt(np.diag(spread))
     if not abs(slope) > _CONSTANTS.travels * slope_std:
-        differ = format_with_std(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
+        differ = format_with_std(*(value * np.ptp(positions[fitted]) for value in (slope, slope_std)))
         raise InputError(
             f"no front travels along the line: the arrival times differ by {differ} between its ends "
             f"(chi-square {chi_square:.3g} of {freedom}); "
@@ -577,7 +591,7 @@ def fit_front(
         speed_std=float(slope_std / slope**2),
         start=float(start),
         start_std=float(start_std),
-        used=np.isin(np.arange(len(positions)), used),
+        is_fitted=np.isin(np.arange(len(positions)), fitted),
         residuals=residuals,
         chi_square=chi_square,
         freedom=freedom,

@@ -23,14 +23,15 @@ import scipy.sparse as sp
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
-_BEYOND = SHORTEST - 2 * np.sqrt(2)
+_MARGIN = SHORTEST - 2 * np.sqrt(2)
 """Elements by which a gauge is longer than to the farthest node of the elements around its centre: nothing on a regular
 mesh, where that is at the root of 2. At an edge, a gauge that did not hold these would hold the nodes of a line."""
 _Function = Callable[[FloatArray], FloatArray]
@@ -90,7 +91,7 @@ class Strain:
     shear_std: FloatArray
 
 
-def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def length_of(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute the length of vectors and its standard uncertainty: first order where long, else that of noise alone.
 
     A length is positive: of nothing but noise it is as large as the noise, where the first order fails. By as much as
@@ -98,7 +99,7 @@ def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, Fl
 
     Parameters
     ----------
-    parts : ndarray, shape (..., d)
+    components : ndarray, shape (..., d)
         Components of the vectors.
     covariance : ndarray, shape (..., d, d)
         Of the components.
@@ -107,9 +108,9 @@ def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, Fl
     -------
     length, std : ndarray, shape (...)
     """
-    square, noise = (parts**2).sum(axis=-1), np.einsum("...aa->...", covariance)
+    square, noise = (components**2).sum(axis=-1), np.einsum("...aa->...", covariance)
     over = np.where(square > 0, square, 1.0)
-    first = np.einsum("...a,...ab,...b->...", parts, covariance, parts) / over
+    first = np.einsum("...a,...ab,...b->...", components, covariance, components) / over
     long = np.maximum(square - noise, 0) / over
     return np.sqrt(square), np.sqrt(np.maximum(long * first + (1 - long) * noise, 0))
 
@@ -161,21 +162,23 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     shear, shear_std = length_of(components @ split.T, split @ covariance @ split.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         equivalent, equivalent_std = _equivalent(of_equivalent, of_hencky)
-        apart = principal[:, 0] - principal[:, 1]
-        direction_std = np.degrees(_deviation(turn, covariance) / apart)
-    parts = {
+        principal_difference = principal[:, 0] - principal[:, 1]
+        direction_std = np.degrees(_deviation(turn, covariance) / principal_difference)
+    arrays = {
         "components": components,
         "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
         "principal": principal,
         "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
-        "direction_deg": np.where(apart > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan),
+        "direction_deg": np.where(principal_difference > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan),
         "direction_std_deg": np.minimum(direction_std, _LARGEST_ANGLE),
         "equivalent": equivalent,
         "equivalent_std": equivalent_std,
         "shear": shear,
         "shear_std": shear_std,
     }
-    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
+    return Strain(
+        measure=measure, **{name: array.reshape((*shape, *array.shape[1:])) for name, array in arrays.items()}
+    )
 
 
 def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
@@ -191,9 +194,9 @@ def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function
     # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
     turned = f @ vectors
     change = [turned[:, :, None, a] * vectors[:, None, :, b] for a in (0, 1) for b in (0, 1)]
-    parts = [2 * change[0] * along[:, 0, None, None], 2 * change[3] * along[:, 1, None, None]]
-    parts.append((change[1] + change[2]) * across[:, None, None])
-    first, second, shear = (part.reshape(-1, 4) for part in parts)
+    terms = [2 * change[0] * along[:, 0, None, None], 2 * change[3] * along[:, 1, None, None]]
+    terms.append((change[1] + change[2]) * across[:, None, None])
+    first, second, shear = (term.reshape(-1, 4) for term in terms)
     slope = np.empty((len(f), 3, 4))
     for row, (i, j) in enumerate(((0, 0), (1, 1), (0, 1))):
         (vi, wi), (vj, wj) = vectors[:, i].T[..., None], vectors[:, j].T[..., None]
@@ -280,6 +283,7 @@ def strain_of(
     return StrainGauges.at_nodes(covariance, gauge).strain(u, v, *std, measure=measure)
 
 
+@state_new_names
 class StrainGauges:
     """Virtual strain gauges of one length at some places.
 
@@ -305,7 +309,7 @@ class StrainGauges:
         lies across a crack or a hole.
     fractions : ndarray, shape (M,)
         Part of each node that is within the gauge's circle.
-    whole : ndarray, shape (2, M)
+    full_weights : ndarray, shape (2, M)
         Weight of every node in the slopes along x and y where all are measured.
     slopes : list of csr_matrix, shape (G, N)
         The same as matrices.
@@ -333,23 +337,23 @@ class StrainGauges:
             )
         lengths = np.full(len(centres), self.length)
         if mesh.is_graded:
-            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
-            lengths = np.maximum(SHORTEST * around, length or 0)
+            mean_size = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
+            lengths = np.maximum(SHORTEST * mean_size, length or 0)
         far = np.zeros(len(centres))
         row, node = needed.nonzero()
-        np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _BEYOND / 2 * mesh.sizes[node])
+        np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _MARGIN / 2 * mesh.sizes[node])
         lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
         self.starts, self.bias = pattern.indptr, covariance.bias
         self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
         self.nodes = pattern.indices.astype(np.int64)
-        away = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
-        self.fractions = np.clip((lengths[self.rows] / 2 - away) / mesh.sizes[self.nodes], 0, 1)
-        self.whole = self.weights(np.ones(len(mesh.nodes), dtype=bool))
-        self.slopes = self._matrices(self.whole)
-        alone = [_products(slope, slope) for slope in self.slopes]
-        together = [_products(part, part) for part in (slope @ covariance.fit for slope in self.slopes)]
-        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
+        distance = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
+        self.fractions = np.clip((lengths[self.rows] / 2 - distance) / mesh.sizes[self.nodes], 0, 1)
+        self.full_weights = self.weights(np.ones(len(mesh.nodes), dtype=bool))
+        self.slopes = self._matrices(self.full_weights)
+        independent = [_products(slope, slope) for slope in self.slopes]
+        correlated = [_products(matrix, matrix) for matrix in (slope @ covariance.fit for slope in self.slopes)]
+        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(correlated, independent, strict=True))
         self.inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
 
     @classmethod
@@ -392,11 +396,11 @@ class StrainGauges:
             A point is outside the mesh, or the gauge is too short.
         """
         mesh = covariance.mesh
-        places = Places.of(mesh, points)
-        places.check("the strain gauge")
-        row, nodes = np.repeat(np.arange(len(points)), 3), mesh.elements[places.element].ravel()
+        mesh_points = MeshPoints.of(mesh, points)
+        mesh_points.check("the strain gauge")
+        row, nodes = np.repeat(np.arange(len(points)), 3), mesh.elements[mesh_points.element].ravel()
         needed = sp.csr_matrix((np.ones(len(row)), (row, nodes)), shape=(len(points), len(mesh.nodes)))
-        return cls(covariance, places.points, length, needed)
+        return cls(covariance, mesh_points.points, length, needed)
 
     def of_nodes(self, nodes: IntArray) -> Self:
         """Return the gauges for the fields of some nodes alone, all of theirs among them.
@@ -412,7 +416,7 @@ class StrainGauges:
         """
         gauges = copy(self)
         gauges.points, gauges.needed, gauges.bias = self.points[nodes], self.needed[:, nodes], self.bias[nodes]
-        gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [part[:, nodes] for part in self.slopes]
+        gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [matrix[:, nodes] for matrix in self.slopes]
         return gauges
 
     def gradient(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -433,19 +437,19 @@ class StrainGauges:
             Of the gradient row by row.
         """
         measured = np.isfinite(u + v + sum(std))
-        weights = self.whole if measured.all() else self.weights(measured)
+        weights = self.full_weights if measured.all() else self.weights(measured)
         values, spread = np.zeros((len(self.centres), 2, 2)), np.zeros((len(self.centres), 4, 4))
         matrices = self.slopes if measured.all() else self._matrices(weights)
         for component, value in enumerate((u, v)):
-            whole, shared = (np.where(measured, part, 0.0) for part in (*std[component::2], np.zeros_like(u))[:2])
-            moved, square = np.where(measured, value, 0.0), np.maximum(whole**2 - shared**2, 0)
-            values[:, component] = np.stack([slope @ moved for slope in matrices], axis=1)
-            products, own = weights[[0, 1, 0]] * weights[[0, 1, 1]], slice(2 * component, 2 * component + 2)
-            sums = np.stack([self._sum(part * square[self.nodes]) for part in products], axis=1) * self.inflation
+            total_std, shared = (np.where(measured, array, 0.0) for array in (*std[component::2], np.zeros_like(u))[:2])
+            displacement, square = np.where(measured, value, 0.0), np.maximum(total_std**2 - shared**2, 0)
+            values[:, component] = np.stack([slope @ displacement for slope in matrices], axis=1)
+            products, block = weights[[0, 1, 0]] * weights[[0, 1, 1]], slice(2 * component, 2 * component + 2)
+            sums = np.stack([self._sum(array * square[self.nodes]) for array in products], axis=1) * self.inflation
             if shared.any():
                 x, y = (slope @ (sp.diags(shared) @ self.bias) for slope in matrices)
                 sums += np.stack([_products(x, x), _products(y, y), _products(x, y)], axis=1)
-            spread[:, own, own] = sums[:, [[0, 2], [2, 1]]]
+            spread[:, block, block] = sums[:, [[0, 2], [2, 1]]]
         return values, spread
 
     def strain(self, u: FloatArray, v: FloatArray, *std: FloatArray, measure: str = MEASURES[0]) -> Strain:
@@ -483,13 +487,13 @@ class StrainGauges:
         use = measured[self.nodes] * self.fractions
         arm = (self.points[self.nodes] - self.centres[self.rows]).T
         count = np.maximum(self._sum(use), np.finfo(float).tiny)
-        x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
+        x, y = (array - (self._sum(use * array) / count)[self.rows] for array in arm)
         xx, xy, yy = (self._sum(use * a * b) for a, b in ((x, x), (x, y), (y, y)))
         determinant = xx * yy - xy * xy
         # a hundredth of the second moment across as along: the nodes lie on a line
         determinant = np.where(determinant > 1e-2 * ((xx + yy) / 2) ** 2, determinant, np.nan)
         determinant[self.needed @ (~measured * 1.0) > 0] = np.nan
-        xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
+        xx, xy, yy = (array[self.rows] / determinant[self.rows] for array in (xx, xy, yy))
         return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 
     def _sum(self, values: AnyArray) -> FloatArray:
@@ -516,7 +520,7 @@ def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: FloatArray, needed: sp.c
 
     near = cKDTree(mesh.nodes).query_ball_point(centres, radius)
     starts = np.cumsum([0, *map(len, near)])
-    columns = np.concatenate([np.asarray(some, dtype=np.int64) for some in near])
+    columns = np.concatenate([np.asarray(indices, dtype=np.int64) for indices in near])
     inside = sp.csr_matrix((np.ones(len(columns)), columns, starts), shape=needed.shape)
     ring, reached = _ring(mesh), sp.csr_matrix(needed > 0) * 1.0
     while True:

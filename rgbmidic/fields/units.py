@@ -140,5 +140,5 @@ def column(name: str, unit: str) -> str:
     """
     plain = unit.replace("²", "2").replace(" √", "_sqrt_")
     over, _, below = plain.partition("/")
-    words = [part for part in ("" if over == "1" else over, f"per_{below}" if below else "") if part]
+    words = [word for word in ("" if over == "1" else over, f"per_{below}" if below else "") if word]
     return "_".join([name, *words])

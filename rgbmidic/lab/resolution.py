@@ -23,8 +23,8 @@ from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.lab import format_number, schema_document, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
-from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
     covariance = NodalCovariance.from_mesh(mesh)
     for length in lengths:
         gauge = StrainGauges.at_nodes(covariance, 8 * length)
-        slope = sp.csr_matrix((gauge.whole[0], (gauge.rows, gauge.nodes)), shape=(len(mesh.nodes),) * 2)
+        slope = sp.csr_matrix((gauge.full_weights[0], (gauge.rows, gauge.nodes)), shape=(len(mesh.nodes),) * 2)
         cut_offs_px.append(_cut_off(mesh, periods, slope @ field, length / 2 + 2, slope=True))
     scale = np.asarray(gauges, dtype=np.float64) / lengths
     return cut_offs_px[0], cut_offs_px[1], scale * np.asarray(cut_offs_px[2:])

@@ -46,7 +46,7 @@ Tests = Mapping[str, Callable[[], TestSettings]]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outcome:
-    """What a test gave.
+    """The outcome of a test: a measured result or the reason of a failure.
 
     Attributes
     ----------
@@ -191,10 +191,10 @@ def run_batch(
     for name, read in tests.items():
         folder = out / name
         try:
-            result, settings, now = _measured(read, folder, workers, progress, overwrite=overwrite)
+            result, settings, is_new = _measured(read, folder, workers, progress, overwrite=overwrite)
             if conclude is not None:
-                conclude(result, settings, now)
-            yield Outcome(name=name, folder=folder, measured=now, values=_values(result, settings, elastic))
+                conclude(result, settings, is_new)
+            yield Outcome(name=name, folder=folder, measured=is_new, values=_values(result, settings, elastic))
         except (RgbmidicError, OSError) as error:
             yield Outcome(name=name, folder=folder, reason=str(error))
 
@@ -203,11 +203,11 @@ def _measured(
     read: Callable[[], TestSettings], folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
 ) -> tuple[Result, TestSettings, bool]:
     """Measure a test unless it is measured already; whether it was measured now comes last."""
-    settings, moved = read(), False
+    settings, has_run = read(), False
 
     def count(done: int, total: int, line: str) -> None:
-        nonlocal moved
-        moved = True
+        nonlocal has_run
+        has_run = True
         if progress is not None:
             progress(done, total, line)
 
@@ -219,19 +219,21 @@ def _measured(
             raise ResultError(f"{reason}; --overwrite measures it again") from None
         logger.warning("%s is measured again: %s", folder.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
-    return result, settings, moved
+    return result, settings, has_run
 
 
 def _values(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> dict[str, float]:
-    """What a result gives for the table of a batch."""
-    ends = result.status[list(result.deformed)]
-    good = float((ends == 0).mean()) if len(ends) else 0.0
+    """Return the values of a result for the table of a batch."""
+    statuses = result.status[list(result.deformed)]
+    good = float((statuses == 0).mean()) if len(statuses) else 0.0
     if good < 0.5:  # as of `rgbmidic run`
-        raise ResultError(f"{int((ends != 0).sum())} of {len(ends)} deformed frames failed or did not converge")
-    values = {"frames": float(len(ends)), "converged": good} | dict(_peaks(result, settings))
+        raise ResultError(f"{int((statuses != 0).sum())} of {len(statuses)} deformed frames failed or did not converge")
+    values = {"frames": float(len(statuses)), "converged": good} | dict(_peaks(result, settings))
     probed = dict(_probed(result, settings, elastic))
-    if both := sorted(values.keys() & probed.keys()):
-        raise InputError(f"channels of {settings.channels.file} have the names of measured columns: {', '.join(both)}")
+    if shared_names := sorted(values.keys() & probed.keys()):
+        raise InputError(
+            f"channels of {settings.channels.file} have the names of measured columns: {', '.join(shared_names)}"
+        )
     return values | probed
 
 
@@ -243,9 +245,9 @@ def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]
         peaks = []
         for frame in frames:
             read = maps.read(name, frame)
-            known = np.flatnonzero(np.isfinite(read.values))
-            if len(known):  # single outliers do not count
-                at = known[np.argsort(read.values[known])[min(len(known) * 99 // 100, len(known) - 1)]]
+            finite = np.flatnonzero(np.isfinite(read.values))
+            if len(finite):  # single outliers do not count
+                at = finite[np.argsort(read.values[finite])[min(len(finite) * 99 // 100, len(finite) - 1)]]
                 peaks.append((float(read.values[at]), float(read.std[at])))
         if peaks:
             unit = maps.field(name).unit
@@ -266,8 +268,8 @@ def _probed(result: Result, settings: TestSettings, elastic: tuple[float, float]
         if quantity.std is not None:
             yield f"peak_{quantity.column}_std", float(quantity.std[at])
     if read.stress_strain is not None:
-        found = modulus(read, *elastic, common_variance_fraction(result))
-        yield from zip(("modulus_MPa", "modulus_MPa_std"), found, strict=True)
+        modulus_and_std = modulus(read, *elastic, common_variance_fraction(result))
+        yield from zip(("modulus_MPa", "modulus_MPa_std"), modulus_and_std, strict=True)
 
 
 def modulus(histories: Histories, low: float, high: float, common_fraction: float) -> tuple[float, float]:
@@ -295,14 +297,14 @@ def modulus(histories: Histories, low: float, high: float, common_fraction: floa
     assert strain.std is not None
     rising = np.arange(len(stress.values)) <= np.nanargmax(np.abs(np.nan_to_num(stress.values)))
     size = np.abs(strain.values)
-    used = rising & (size >= low) & (size <= high) & np.isfinite(stress.values + strain.values + strain.std)
-    if used.sum() < 3:
+    in_range = rising & (size >= low) & (size <= high) & np.isfinite(stress.values + strain.values + strain.std)
+    if in_range.sum() < 3:
         return math.nan, math.nan
-    weight = 1 / ((1 - common_fraction) * strain.std[used] ** 2)
-    x, y = stress.values[used], strain.values[used]
-    away = x - (weight * x).sum() / weight.sum()
-    moment = (weight * away**2).sum()
-    slope = float((weight * away * y).sum() / moment) if moment > 0 else math.nan
+    weight = 1 / ((1 - common_fraction) * strain.std[in_range] ** 2)
+    x, y = stress.values[in_range], strain.values[in_range]
+    deviation = x - (weight * x).sum() / weight.sum()
+    moment = (weight * deviation**2).sum()
+    slope = float((weight * deviation * y).sum() / moment) if moment > 0 else math.nan
     return (1 / slope, float(1 / math.sqrt(moment) / slope**2)) if slope else (math.nan, math.nan)
 
 
@@ -324,14 +326,20 @@ def summary_rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]
     rows = []
     for outcome in outcomes:
         state = "failed" if outcome.reason else "measured" if outcome.measured else "measured before"
-        own = cells(outcome.values.get(name, math.nan) for name in names)
-        rows.append([outcome.name, state, outcome.reason, str(outcome.folder), *own])
-    known = [[one.values[name] for one in outcomes if np.isfinite(one.values.get(name, math.nan))] for name in names]
-    means = (float(np.mean(part)) if part else math.nan for part in known)
-    deviations = (float(np.std(part, ddof=1)) if len(part) > 1 else math.nan for part in known)
+        value_cells = cells(outcome.values.get(name, math.nan) for name in names)
+        rows.append([outcome.name, state, outcome.reason, str(outcome.folder), *value_cells])
+    values_by_column = [
+        [outcome.values[name] for outcome in outcomes if np.isfinite(outcome.values.get(name, math.nan))]
+        for name in names
+    ]
+    means = (float(np.mean(column_values)) if column_values else math.nan for column_values in values_by_column)
+    deviations = (
+        float(np.std(column_values, ddof=1)) if len(column_values) > 1 else math.nan
+        for column_values in values_by_column
+    )
     rows.append(["mean", "", "", "", *cells(means)])
     rows.append(["standard deviation", "", "", "", *cells(deviations)])
-    rows.append(["tests", "", "", "", *(str(len(part)) for part in known)])
+    rows.append(["tests", "", "", "", *(str(len(column_values)) for column_values in values_by_column)])
     return [*_HEADER, *names], rows
 
 

@@ -22,7 +22,7 @@ from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Status, TrackingState
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
-from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
+from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.warnings import collect_messages
@@ -31,18 +31,18 @@ logger = logging.getLogger(__name__)
 
 
 class Sink(Protocol):
-    """Where measured frames go, by their places in the result."""
+    """A sink takes the measured frames, by their positions in the result."""
 
-    def is_finished(self, place: int) -> bool:
-        """Whether a frame is there already."""
+    def is_finished(self, position: int) -> bool:
+        """Return whether a frame is in the result already."""
 
-    def start_after(self, place: int) -> TrackingState:
+    def start_after(self, position: int) -> TrackingState:
         """Initial guess of the frames that follow a finished one."""
 
-    def updated(self, places: Sequence[int]) -> Updated:
+    def updated(self, positions: Sequence[int]) -> ReferenceHistory:
         """Frames that became the reference, or the reference that they make."""
 
-    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
+    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
         """Take a frame, and the initial guess of those that follow it."""
 
 
@@ -53,33 +53,33 @@ class Schedule:
     not measured well from there is measured once more from the frame just before it, and the better of both is kept.
     """
 
-    def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
+    def __init__(self, plan: Plan, sink: Sink, positions: Iterable[int] = ()) -> None:
         self._plan, self._sink = plan, sink
         self._ready, self._wanted = list[tuple[int, TrackingState]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
-        self._first_tries: dict[int, Measured] = {}
-        for place in places:
-            self.want(place)
+        self._first_tries: dict[int, FrameOutcome] = {}
+        for position in positions:
+            self.want(position)
 
     @property
     def done(self) -> bool:
-        """Whether nothing is left to be measured."""
+        """Return whether nothing is left to be measured."""
         return not self._ready
 
-    def want(self, place: int) -> None:
+    def want(self, position: int) -> None:
         """Have a frame measured, and all that it depends on."""
-        if not (place in self._wanted or self._sink.is_finished(place)):
-            self._wanted.add(place)
-            self._start_from(parent(place), place)
+        if not (position in self._wanted or self._sink.is_finished(position)):
+            self._wanted.add(position)
+            self._start_from(parent(position), position)
 
-    def _start_from(self, before: int | None, place: int) -> None:
+    def _start_from(self, before: int | None, position: int) -> None:
         """Have a frame measured as soon as the frame `before` it is; None: from a search."""
         if before is None:
-            self._ready.append((place, TrackingState(displacement=None)))
+            self._ready.append((position, TrackingState(displacement=None)))
         elif self._sink.is_finished(before):
-            self._ready.append((place, self._sink.start_after(before)))
+            self._ready.append((position, self._sink.start_after(before)))
         else:
-            self._waiting.setdefault(before, []).append(place)
+            self._waiting.setdefault(before, []).append(position)
             self.want(before)
 
     def run(self, workers: Threads | Cluster) -> None:
@@ -92,17 +92,17 @@ class Schedule:
         FrameError
             All files of the frames are gone.
         """
-        running: dict[Future[Measured], tuple[int, TrackingState]] = {}
+        running: dict[Future[FrameOutcome], tuple[int, TrackingState]] = {}
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
-                place, start = self._next(workers.slots)
+                position, start = self._next(workers.slots)
                 updated = self._sink.updated(start.reference_updates[-1:])  # all that the reference depends on
                 # a key frame looks for what has been lost; frames between key frames follow what there is
-                own = replace(start, unmeasured=0.0) if is_key(place) else start
-                running[workers.submit(self._plan.series.selected[place], own, updated)] = place, start
+                frame_start = replace(start, unmeasured=0.0) if is_key(position) else start
+                running[workers.submit(self._plan.series.selected[position], frame_start, updated)] = position, start
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                place, start = running.pop(future)
-                self._take(place, start, self._outcome(future, self._plan.series.selected[place]))
+                position, start = running.pop(future)
+                self._take(position, start, self._outcome(future, self._plan.series.selected[position]))
 
     def _next(self, slots: int) -> tuple[int, TrackingState]:
         """Take the frame that is to be measured next out of those that can be.
@@ -110,41 +110,41 @@ class Schedule:
         Of the earliest chains, one more than several frames are measured at a time, it is that of the chain which is
         behind: at the end of a test none is left alone.
         """
-        chains = nsmallest(slots + (slots > 1), self._ready, key=lambda one: one[0])
-        found = min(chains, key=lambda one: one[0] % STRIDE)
-        self._ready.remove(found)
-        return found
+        chains = nsmallest(slots + (slots > 1), self._ready, key=lambda item: item[0])
+        entry = min(chains, key=lambda item: item[0] % STRIDE)
+        self._ready.remove(entry)
+        return entry
 
-    def _outcome(self, future: Future[Measured], index: int) -> Measured:
-        """What a worker found, or why it found nothing."""
+    def _outcome(self, future: Future[FrameOutcome], index: int) -> FrameOutcome:
+        """Return the outcome of a worker, or a failed frame with the reason where the worker died."""
         try:
-            found = future.result()
+            outcome = future.result()
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
             reason = f"its worker died: {type(error).__name__}"
-            return Measured(record=failed_frame(self._plan, index, reason))
-        for level, text in found.messages:
+            return FrameOutcome(record=failed_frame(self._plan, index, reason))
+        for level, text in outcome.messages:
             logger.log(level, "%s", text)
-        return found
+        return outcome
 
-    def _take(self, place: int, start: TrackingState, found: Measured) -> None:
+    def _take(self, position: int, start: TrackingState, outcome: FrameOutcome) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
-        if found.record.unread and (gone := self._plan.series.missing_lights()):
+        if outcome.record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
-        first = self._first_tries.pop(place, None)
-        lost = found.record.status != Status.CONVERGED or rank_of(found.record)[1] > start.unmeasured + 0.01
-        if first is None and is_key(place) and lost:  # a hundredth of the nodes more than where it started from
-            self._first_tries[place] = found
-            self._start_from(place - 1, place)
+        first = self._first_tries.pop(position, None)
+        lost = outcome.record.status != Status.CONVERGED or rank_of(outcome.record)[1] > start.unmeasured + 0.01
+        if first is None and is_key(position) and lost:  # a hundredth of the nodes more than where it started from
+            self._first_tries[position] = outcome
+            self._start_from(position - 1, position)
             return
         if first is not None:
-            better = min(first, found, key=lambda one: rank_of(one.record))
-            found = replace(better, record=replace(better.record, values={**better.record.values, "tries": 2}))
-        after = following(self._plan, found.record.values, start)
-        self._sink.keep(place, found, after)
-        self._wanted.discard(place)
-        self._ready += [(one, after) for one in self._waiting.pop(place, ())]
+            better = min(first, outcome, key=lambda item: rank_of(item.record))
+            outcome = replace(better, record=replace(better.record, values={**better.record.values, "tries": 2}))
+        initial_guess = next_start(self._plan, outcome.record.values, start)
+        self._sink.keep(position, outcome, initial_guess)
+        self._wanted.discard(position)
+        self._ready += [(item, initial_guess) for item in self._waiting.pop(position, ())]
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:
@@ -152,15 +152,15 @@ def rank_of(record: FrameRecord) -> tuple[bool, float]:
     return rank(int(record.status), record.node_status)
 
 
-def following(plan: Plan, kept: Mapping[str, Any], start: TrackingState) -> TrackingState:
-    """Where a frame starts that follows one that started from `start` and of which this is kept."""
-    measured = kept["node_status"] == NodeStatus.MEASURED
+def next_start(plan: Plan, values: Mapping[str, Any], start: TrackingState) -> TrackingState:
+    """Return the initial guess of the frames after one that started from `start` and has these `values`."""
+    measured = values["node_status"] == NodeStatus.MEASURED
     if not measured.any():
         return start
-    reference, displacement = plan.reference, np.stack([kept["u"], kept["v"]], axis=1)
-    after = start.extrapolate(reference.mesh, displacement, measured, reference.constants)
-    updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
-    return replace(after, reference_updates=updates, best_match=best)
+    reference, displacement = plan.reference, np.stack([values["u"], values["v"]], axis=1)
+    initial_guess = start.extrapolate(reference.mesh, displacement, measured, reference.constants)
+    updates, best = tuple(values["reference_updates"].tolist()), float(values["best_match"])
+    return replace(initial_guess, reference_updates=updates, best_match=best)
 
 
 class Threads:
@@ -178,14 +178,14 @@ class Threads:
         self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None
 
-    def submit(self, index: int, start: TrackingState, updated: Updated = ()) -> Future[Measured]:
+    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
         """Have one frame measured, at once where there is one thread."""
         if self._executor is None:
-            done: Future[Measured] = Future()
-            done.set_result(attempt(self._plan, index, start, updated))
+            done: Future[FrameOutcome] = Future()
+            done.set_result(measure_frame_safely(self._plan, index, start, updated))
             return done
         self._count(1)
-        future = self._executor.submit(attempt, self._plan, index, start, updated)
+        future = self._executor.submit(measure_frame_safely, self._plan, index, start, updated)
         future.add_done_callback(lambda _: self._count(-1))
         return future
 
@@ -196,14 +196,14 @@ class Threads:
         set_threads(self._before[0])
         cv2.setNumThreads(self._before[1])
 
-    def _count(self, more: int) -> None:
+    def _count(self, change: int) -> None:
         """Divide the threads that share kernels among the frames that are being measured."""
         with self._lock:
-            self._running += more
-            each = max(self._before[0] // max(self._running, 1), 1)
-            if each != threads():
-                set_threads(each)
-                cv2.setNumThreads(each)
+            self._running += change
+            threads_per_frame = max(self._before[0] // max(self._running, 1), 1)
+            if threads_per_frame != threads():
+                set_threads(threads_per_frame)
+                cv2.setNumThreads(threads_per_frame)
 
 
 class Cluster:
@@ -236,10 +236,10 @@ class Cluster:
         with _answering():
             return max(sum(map(int, self._client.nthreads().values())), 1)
 
-    def submit(self, index: int, start: TrackingState, updated: Updated = ()) -> Future[Measured]:
+    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
         """Have one frame measured by some worker."""
         with _answering():
-            future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, updated)
+            future: Future[FrameOutcome] = self._executor.submit(_measure_on_cluster, self._plan, index, start, updated)
         return future
 
     def close(self) -> None:
@@ -271,10 +271,10 @@ def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Thread
     return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
 
 
-def _measure_elsewhere(plan: Plan, index: int, start: TrackingState, updated: Updated) -> Measured:
+def _measure_on_cluster(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory) -> FrameOutcome:
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
     with collect_messages() as messages:
-        found = attempt(plan, index, start, updated)
-    return Measured(record=found.record, messages=tuple(messages))
+        outcome = measure_frame_safely(plan, index, start, updated)
+    return FrameOutcome(record=outcome.record, messages=tuple(messages))

@@ -33,8 +33,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.plan import STRIDE, Plan, parent
-from rgbmidic.pipeline.suitability import (
+from rgbmidic.pipeline.frame_quality import (
     SUITABILITY,
     clipping,
     exposure_fault,
@@ -42,6 +41,7 @@ from rgbmidic.pipeline.suitability import (
     too_small,
     unsteady,
 )
+from rgbmidic.pipeline.plan import STRIDE, Plan, parent
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage
@@ -53,8 +53,8 @@ LEAST_GAIN = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """What measuring a frame gave.
+class FrameOutcome:
+    """The outcome of a frame: its record, and its solution where this process has it.
 
     Attributes
     ----------
@@ -71,11 +71,11 @@ class Measured:
     messages: tuple[tuple[int, str], ...] = ()
 
 
-Updated = Sequence[tuple[int, Solution]] | ReferenceUpdate
+ReferenceHistory = Sequence[tuple[int, Solution]] | ReferenceUpdate
 """Index and solution of the last frame that became the reference, all that it depends on; or the reference."""
 
 
-def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Updated = ()) -> FrameRecord:
+def measure_frame(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -97,25 +97,25 @@ def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Updated
     -------
     FrameRecord
     """
-    return attempt(plan, index, start, updated).record
+    return measure_frame_safely(plan, index, start, updated).record
 
 
-def attempt(plan: Plan, index: int, start: TrackingState, updated: Updated = ()) -> Measured:
+def measure_frame_safely(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> FrameOutcome:
     """Measure a frame as `measure_frame`, which gives the record alone."""
     try:
         with record_stages(plan.timings) as seconds:
             values = solve_frame(plan, index, start, _reference_of(plan, updated))
         record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
-        return Measured(record=record, solution=values["solution"])
+        return FrameOutcome(record=record, solution=values["solution"])
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
     except Exception as error:  # whatever it is, the other frames can be measured
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return Measured(record=failed_frame(plan, index, reason, unread=unread))
+    return FrameOutcome(record=failed_frame(plan, index, reason, unread=unread))
 
 
-def _reference_of(plan: Plan, updated: Updated) -> ReferenceUpdate:
+def _reference_of(plan: Plan, updated: ReferenceHistory) -> ReferenceUpdate:
     """The reference that an update makes; the first without."""
     if isinstance(updated, ReferenceUpdate):
         return updated
@@ -138,12 +138,12 @@ def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -
     return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number, time_ns=time_ns, unread=unread)
 
 
-def messages(kept: Mapping[str, Any]) -> list[str]:
+def messages(values: Mapping[str, Any]) -> list[str]:
     """Warnings of a frame of which ``status``, ``reason`` and ``warnings`` are kept, and how it ended if not well."""
-    texts = list[str](map(str, kept["warnings"]))
-    if kept["reason"]:
-        end = "did not converge" if kept["status"] == Status.NOT_CONVERGED else "cannot be measured"
-        texts.append(f"{end}: {kept['reason']}")
+    texts = list[str](map(str, values["warnings"]))
+    if values["reason"]:
+        end = "did not converge" if values["status"] == Status.NOT_CONVERGED else "cannot be measured"
+        texts.append(f"{end}: {values['reason']}")
     return texts
 
 
@@ -167,7 +167,7 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
 
 
 def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: ReferenceUpdate) -> dict[str, Any]:
-    """What `FrameRecord.from_solution` is given: the ``solution`` of a frame, and what else its record holds.
+    """Measure a frame: return the arguments of `FrameRecord.from_solution`, the ``solution`` and what else is recorded.
 
     Parameters
     ----------
@@ -182,57 +182,57 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
         The frame cannot be read or is not what the settings say.
     """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
-    place = plan.series.selected.index(index)
+    position = plan.series.selected.index(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     window = plan.window_of(start.displacement, reference_update.displacement)
-    here = plan.window.slices_in(window)
+    reference_slices = plan.window.slices_in(window)
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
-    there = state
+    windowed_state = state
     if not isinstance(state, IlluminationImages):
-        there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
-    warnings = exposure_warnings(plan, there)
+        windowed_state = tuple(replace(frame, values=frame.values[..., *reference_slices]) for frame in state)
+    warnings = exposure_warnings(plan, windowed_state)
     with stage("separation"):
         images = light_images(plan.separation, state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        ready, weights = plan.prepared(images, index)
-        deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
+        grey_levels, weights = plan.prepared(images, index)
+        deformed = Deformed.prepare(grey_levels, weights, prefilter=plan.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // 256)  # of the pictures of weights and reflections, 256 px at most
-        thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
-        del ready, weights  # a tenth of what a frame needs
+        thumbnail = _to_uint8(weights[:, *reference_slices][:, ::step, ::step])
+        del grey_levels, weights  # a tenth of what a frame needs
     solution = reference_update.track(deformed, start, plan.solver, plan.method)
     if solution.status is not Status.CONVERGED:
-        causes = [solution.reason, *_causes(plan, there, images, reference.offset(deformed), solution)]
+        causes = [solution.reason, *_causes(plan, windowed_state, images, reference.offset(deformed), solution)]
         if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
             causes = [unsteady(plan.reference_motion)]
         solution = replace(solution, reason="; ".join(causes))
     if solution.disagreement:
         warnings.append(solution.disagreement)
-    key = place % STRIDE == 0 or place == len(plan.series.selected) - 1
+    key = position % STRIDE == 0 or position == len(plan.series.selected) - 1
     if solution.measured.any():
         with stage("conclusion"):
-            found = solution
+            tracked = solution
             if settings.mesh.error is True or (settings.mesh.error == "key" and key):
-                solution = discretisation_error(reference, deformed, found, plan.solver, plan.method)
+                solution = discretisation_error(reference, deformed, tracked, plan.solver, plan.method)
             else:
-                solution = with_one_sided_error(reference.mesh, found)
-            if unresolved := unresolved_strain(reference.mesh, found, solution):
+                solution = with_one_sided_error(reference.mesh, tracked)
+            if unresolved := unresolved_strain(reference.mesh, tracked, solution):
                 warnings.append(unresolved)
-    kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-    moved = solution.displacement - reference.offset(deformed)
-    brightness = brightness_change(plan.images.values, images.values, reference, moved)
-    for light, _ in _dark(images.names, brightness):
+    filled = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
+    displacement = solution.displacement - reference.offset(deformed)
+    brightness = brightness_change(plan.images.values, images.values, reference, displacement)
+    for light, _ in _dimmed_lights(images.names, brightness):
         warnings.append(f"{light} gives less than {LEAST_GAIN:.0%} of its light in the reference")
-    match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
+    match, best, reference_updates = _compare_with_reference(plan, index, start, reference_update, deformed, solution)
     if len(reference_updates) > len(start.reference_updates):
         warnings.append("becomes the reference of those after it")
     warnings += _blur_warning(plan, index, start, solution)
-    reflection = images.reflection_index(step, here)
+    reflection = images.reflection_index(step, reference_slices)
     return {
-        "solution": kept,
+        "solution": filled,
         "warnings": warnings,
         "number": plan.series.numbers[index],
         "time_ns": plan.series.time_ns(index),
@@ -241,32 +241,32 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
         "best_match": best,
         "reference_updates": reference_updates,
         "weights_thumbnail": thumbnail,
-        "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
+        "reflection_thumbnail": None if reflection is None else _to_uint8(reflection),
         "inputs": inputs,
         "machine": machine(),
-        "checksum": checksum(there),
+        "checksum": checksum(windowed_state),
     }
 
 
 def checksum(state: RawState) -> int:
     """Return the CRC-32 of the samples of a state."""
     samples = (state,) if isinstance(state, IlluminationImages) else state
-    return zlib.crc32(b"".join(one.values.tobytes() for one in samples))
+    return zlib.crc32(b"".join(frame.values.tobytes() for frame in samples))
 
 
 def _causes(
     plan: Plan, state: RawState, images: IlluminationImages, offset: FloatArray, solution: Solution
 ) -> list[str]:
-    """What may be why a frame did not converge or cannot be measured, and what to change.
+    """Return what may be why a frame did not converge or cannot be measured, and what to change.
 
     `state` is cut to the reference's window, which begins at `offset` (x, y) in the `images`' own.
     """
     causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
-    there = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
-    brightness = brightness_change(plan.images.values, images.values, plan.reference, there)
+    displacement = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
+    brightness = brightness_change(plan.images.values, images.values, plan.reference, displacement)
     causes += [
         f"{light} shows the speckle with {gain:.0%} of its contrast in the reference: look at lamp and exposure"
-        for light, gain in _dark(images.names, brightness)
+        for light, gain in _dimmed_lights(images.names, brightness)
         if not fault
     ]
     if small := too_small(plan.element_size, plan.speckle):
@@ -296,7 +296,7 @@ def prepared_frame(plan: Plan, index: int, window: Window) -> tuple[FloatImage, 
     return plan.prepared(light_images(plan.separation, state, window), index)
 
 
-def _compared(
+def _compare_with_reference(
     plan: Plan,
     index: int,
     start: TrackingState,
@@ -304,7 +304,7 @@ def _compared(
     deformed: Deformed,
     solution: Solution,
 ) -> tuple[float, float, tuple[int, ...]]:
-    """How well a frame matches its reference, the best match of the frames on it, and who follows as the reference."""
+    """Return how well a frame matches its reference, the best match of frames on it, and the next reference updates."""
     if not (plan.settings.frames.update_reference and solution.measured.any()):
         return float("nan"), start.best_match, start.reference_updates
     match = reference_update.match(deformed, solution)
@@ -315,45 +315,50 @@ def _compared(
     return median, 0.0, (*start.reference_updates, plan.series.selected.index(index))
 
 
-def _dark(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
+def _dimmed_lights(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
     """The lights whose lamp seems to fail: they give less than `LEAST_GAIN` of their light in the reference."""
     return [(light, gain) for light, gain in zip(lights, brightness[:, 0], strict=True) if gain < LEAST_GAIN]
 
 
 def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
-    """What is doubtful about the exposure of a frame that is cut to the reference's window, a text each.
+    """Return what is doubtful about the exposure of a frame that is cut to the reference's window, a text each.
 
     They have no figures of the frame, so that one line says it of many frames.
     """
-    warnings, most = list[str](), plan.saturated + SUITABILITY.saturated
-    if saturated_fraction(state, plan.region.mask) > most:
+    warnings, max_saturated = list[str](), plan.saturated + SUITABILITY.saturated
+    if saturated_fraction(state, plan.region.mask) > max_saturated:
         warnings.append(
-            f"more than {most:.0%} of the samples in the region are saturated, {plan.saturated:.0%} in the reference: "
-            "look at the exposure"
+            f"more than {max_saturated:.0%} of the samples in the region are saturated, {plan.saturated:.0%} in the "
+            "reference: look at the exposure"
         )
-    if plan.clipped_at is None and (found := clipping(state)):
-        warnings.append(found[1])
+    if plan.clipped_at is None and (pile_up := clipping(state)):
+        warnings.append(pile_up[1])
     return warnings
 
 
 def _blur_warning(plan: Plan, index: int, start: TrackingState, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
-    place = plan.series.selected.index(index)
-    if parent(place) != place - 1 or start.displacement is None or not solution.measured.any() or not plan.exposure:
+    position = plan.series.selected.index(index)
+    if (
+        parent(position) != position - 1
+        or start.displacement is None
+        or not solution.measured.any()
+        or not plan.exposure
+    ):
         return []
-    before = plan.series.selected[place - 1]
+    before = plan.series.selected[position - 1]
     times = [plan.series.time_ns(number) for number in (before, index)]
     rate = plan.settings.scale.frame_rate or plan.series.recording.frame_rate
     if None not in times:
         seconds = 1e-9 * float(np.diff(np.array(times, dtype=np.int64))[0])
     else:
         seconds = (plan.series.numbers[index] - plan.series.numbers[before]) / rate if rate else 0.0
-    moved = np.hypot(*(solution.displacement - start.displacement)[solution.measured].T)
-    if seconds <= 0 or plan.exposure / seconds * float(np.quantile(moved, 0.95)) <= SUITABILITY.blur:
+    distances = np.hypot(*(solution.displacement - start.displacement)[solution.measured].T)
+    if seconds <= 0 or plan.exposure / seconds * float(np.quantile(distances, 0.95)) <= SUITABILITY.blur:
         return []
     exposed = f"while it is exposed ({1e6 * plan.exposure:g} µs)"
     return [f"motion blur: the specimen moves by more than {SUITABILITY.blur:g} px {exposed}"]
 
 
-def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:
-    return np.round(shares * 255).astype(np.uint8)
+def _to_uint8(fractions: FloatImage) -> npt.NDArray[np.uint8]:
+    return np.round(fractions * 255).astype(np.uint8)

@@ -43,9 +43,9 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.placement import place_on_image
-from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.objects import check_given
+from rgbmidic.pipeline import frame_quality
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
+from rgbmidic.pipeline.user_objects import check_user_objects
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -60,7 +60,7 @@ _WORTH = 0.5
 
 
 class ProcessState:
-    """What the threads of one process share; a copy that is sent to another process has its own.
+    """The threads of one process share this state; a copy that is sent to another process has its own.
 
     Attributes
     ----------
@@ -68,10 +68,10 @@ class ProcessState:
         Frames are read by one thread at a time: a movie has one place at which it is read.
     """
 
-    def __init__(self, kept: int = 2) -> None:
-        """`kept` updated references stay: frames measured side by side follow this one or the last."""
+    def __init__(self, capacity: int = 2) -> None:
+        """`capacity` updated references stay: frames measured side by side follow this one or the last."""
         self.reading, self._updating = Lock(), Lock()
-        self._updates: deque[tuple[tuple[int, ...], ReferenceUpdate]] = deque(maxlen=kept)
+        self._updates: deque[tuple[tuple[int, ...], ReferenceUpdate]] = deque(maxlen=capacity)
 
     def __reduce__(self) -> tuple[type[ProcessState], tuple[()]]:
         return type(self), ()
@@ -79,8 +79,8 @@ class ProcessState:
     def reference_update(self, frames: tuple[int, ...], make: Callable[[], ReferenceUpdate]) -> ReferenceUpdate:
         """The reference that the `frames` make in turn: a kept one, else what `make` gives, once for all threads."""
         with self._updating:
-            for known, reference_update in self._updates:
-                if known == frames:
+            for update_frames, reference_update in self._updates:
+                if update_frames == frames:
                     return reference_update
             self._updates.append((frames, make()))
             return self._updates[-1][1]
@@ -88,7 +88,7 @@ class ProcessState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What all frames of a test share; it can be pickled, so that any process can measure any frame.
+    """All frames of a test share a plan; it can be pickled, so that any process can measure any frame.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ class Plan:
             The settings, the calibration, the region or the reference frames are not usable, or an object contradicts
             the settings.
         """
-        check_given(settings, source, separation, weights, mesh)
+        check_user_objects(settings, source, separation, weights, mesh)
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
         series = open_frames(settings, source, camera)
         frame = series.shape
@@ -201,12 +201,12 @@ class Plan:
             plane.check(frame)
             plane.check_light(None if calibration is None else calibration.registration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        given = any(one is not None for one in (source, weights, mesh, region))
+        has_objects = any(item is not None for item in (source, weights, mesh, region))
         finite_elements, placement = None, None
         if settings.mesh.file is not None:
             finite_elements, placement, mesh, region = finite_elements_of(settings, frame)
         region, window = region or read_region(settings.region, frame), Window.of_frame(frame)
-        if not given and isinstance(separate, WindowedSeparation):
+        if not has_objects and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
             region = region.crop(*window.slices_in(Window.of_frame(frame)))
         state, images, separate, motion = _read_reference(settings, series, separate, window, region, calibration)
@@ -234,9 +234,9 @@ class Plan:
             weights=weights,
             images=images,
             reference=_reference(images, weights, region, mesh, settings.solver),
-            speckle=suitability.speckle_size(images, region),
-            saturated=suitability.saturated_fraction(state, region.mask),
-            clipped_at=None if (clipping := suitability.clipping(state)) is None else clipping[0],
+            speckle=frame_quality.speckle_size(images, region),
+            saturated=frame_quality.saturated_fraction(state, region.mask),
+            clipped_at=None if (clipping := frame_quality.clipping(state)) is None else clipping[0],
             reference_motion=motion,
             exposure=1e-9 * (series.recording.exposure_ns or 0),
             window=window,
@@ -255,7 +255,7 @@ class Plan:
 
     @property
     def method(self) -> PrecisionMethod | None:
-        """How the lights are weighted by their residuals; None: by `weights` only."""
+        """Return the method that weighs the lights by their residuals; None: they are weighted by `weights` only."""
         return precision_method(self.weights, self.settings.weights.method)
 
     def on_mesh(self, mesh: Tri3Mesh) -> Plan:
@@ -274,7 +274,7 @@ class Plan:
         return replace(self, reference=reference)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
-        """What the solve takes of the images of frame `index`: grey levels and weights, (k, H, W) each.
+        """Prepare the images of frame `index` for the solve: grey levels and weights, (k, H, W) each.
 
         Parameters
         ----------
@@ -313,8 +313,8 @@ class Plan:
         if self.window.is_whole:
             return self.window
         nodes = self.reference.mesh.nodes + self.window.origin
-        places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
-        return window_around(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
+        positions = [nodes, *(nodes + displacement for displacement in displacements if displacement is not None)]
+        return window_around(np.concatenate(positions), search_reach(nodes), self.settings, self.window.frame)
 
 
 def _reference(
@@ -347,11 +347,11 @@ def _read_reference(
     Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
     """
     indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
-    motion = suitability.ReferenceMotion(region.mask)
+    motion = frame_quality.ReferenceMotion(region.mask)
     states = list(motion.watch(series.read(index, window) for index in indices[:2]))
     raw = [state for state in states if not isinstance(state, IlluminationImages)]
     for frame in raw[0] if raw else ():
-        if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
+        if shifted := frame_quality.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
             raise FrameError(f"the reference ({name}): {shifted}")
         # twice as much has a bit more than the level: it is not the camera's, or deliberately low
         if (largest := samples.max()) > 2 * frame.white_level:
@@ -359,24 +359,26 @@ def _read_reference(
                 f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
                 "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
             )
-    saturated = suitability.saturated_fraction(states[0], region.mask)
+    saturated = frame_quality.saturated_fraction(states[0], region.mask)
     # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
     if saturated > 0.98:
-        fault = suitability.exposure_fault(states[0], region.mask)
+        fault = frame_quality.exposure_fault(states[0], region.mask)
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    if saturated > suitability.SUITABILITY.clipped:
+    if saturated > frame_quality.SUITABILITY.clipped:
         text = f"{100 * saturated:.2g} % of the samples in the region of the reference ({name}) are saturated"
         logger.warning("%s and will not be measured", text)
     if calibration is not None and raw:
-        seen = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
+        window_calibration = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
         # a camera that shakes adds to the difference of two frames: it is not the noise that is calibrated
-        repeat = raw[1] if len(raw) > 1 and motion.largest < suitability.SUITABILITY.shake else None
-        for found in check_state(raw[0], seen, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
-            if found.passed:
-                logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
-    others = motion.watch(series.read(index, window) for index in indices[2:])
-    images, learnt = reference_images(separation, chain(states, others), window)
-    return states[0], images, learnt, motion.largest
+        repeat = raw[1] if len(raw) > 1 and motion.largest < frame_quality.SUITABILITY.shake else None
+        for check in check_state(
+            raw[0], window_calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat
+        ):
+            if check.passed:
+                logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, check.text)
+    remaining_states = motion.watch(series.read(index, window) for index in indices[2:])
+    images, adapted_separation = reference_images(separation, chain(states, remaining_states), window)
+    return states[0], images, adapted_separation, motion.largest
 
 
 def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> None:
@@ -386,32 +388,32 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
     if isinstance(weights, ThresholdWeights) and (
         (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum()
     ):
-        most = blurred(images, weights.blur)[:, inside].max() / images.full_scale
+        max_level = blurred(images, weights.blur)[:, inside].max() / images.full_scale
         logger.warning(
             f"weights.threshold = {weights.threshold:.3g} excludes nothing in the reference: no light, blurred over "
-            f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
+            f"{weights.blur:g} px, exceeds {max_level:.2g} of the dynamic range in the region. State a lower one, or "
             'weights.method = "statistics"'
         )
     if plan.finite_elements is not None:
-        suitability.tell_small(plan.reference.mesh, plan.speckle, plan.finite_elements)
-    elif small := suitability.too_small(plan.element_size, plan.speckle, suitability.SUITABILITY.hardly_enough):
+        frame_quality.warn_small_elements(plan.reference.mesh, plan.speckle, plan.finite_elements)
+    elif small := frame_quality.too_small(plan.element_size, plan.speckle, frame_quality.SUITABILITY.hardly_enough):
         logger.warning("%s", small)
     if not plan.reference.pixel_weights.any():
-        fault = suitability.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
+        fault = frame_quality.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    suitability.check_texture(state, inside, name)
-    if plan.reference_motion > suitability.SUITABILITY.motion:
-        logger.warning("%s", suitability.unsteady(plan.reference_motion))
-    if clipping := suitability.clipping(state):
+    frame_quality.check_texture(state, inside, name)
+    if plan.reference_motion > frame_quality.SUITABILITY.motion:
+        logger.warning("%s", frame_quality.unsteady(plan.reference_motion))
+    if clipping := frame_quality.clipping(state):
         logger.warning("the reference (%s): %s", name, clipping[1])
-    if repeated := suitability.repetition(images, region, plan.speckle):
+    if repeated := frame_quality.repetition(images, region, plan.speckle):
         logger.warning("the reference (%s): %s", name, repeated)
-    for doubt in suitability.separation_doubts(images, region):
+    for doubt in frame_quality.separation_doubts(images, region):
         logger.warning("the reference (%s): %s", name, doubt.text)
-    dark = suitability.background_fraction(images, region, plan.speckle, noise)
+    dark = frame_quality.background_fraction(images, region, plan.speckle, noise)
     if dark > CONTRAST.max_hidden_fraction:
         logger.warning(f"the region holds dark background ({dark:.1%}) in the reference: draw it inside the specimen")
-    levels = suitability.light_levels(images, region).items()
+    levels = frame_quality.light_levels(images, region).items()
     off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]
     if off and not isinstance(state, IlluminationImages):
         logger.warning(
@@ -428,9 +430,9 @@ def finite_elements_of(
     camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
     placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
-    every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    part, mesh, region = place_on_image(every, placement, frame, read_region(settings.region, frame))
-    return part, placement, mesh, region
+    whole_mesh = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
+    measured_mesh, mesh, region = place_on_image(whole_mesh, placement, frame, read_region(settings.region, frame))
+    return measured_mesh, placement, mesh, region
 
 
 def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int, int]) -> Window:
@@ -442,7 +444,7 @@ def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int
 
 
 def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
-    """What lies within `reach` of points (N, 2), and what its images depend on.
+    """Return the window within `reach` of points (N, 2), and what its images depend on.
 
     The separation's local statistics use 96 px around: three standard deviations of their windows with all that is
     between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
@@ -504,17 +506,17 @@ def parent(position: int) -> int | None:
 
 
 def is_key(position: int) -> bool:
-    """Whether a frame starts from one that is not just before it."""
+    """Return whether a frame starts from one that is not just before it."""
     return position > 0 and position % STRIDE == 0
 
 
-def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
+def dependants(positions: Iterable[int], tries: Sequence[int]) -> set[int]:
     """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
 
     A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
     """
-    found = set(places)
-    for place, tried in enumerate(tries):
-        if parent(place) in found or (tried > 1 and place - 1 in found):
-            found.add(place)
-    return found
+    affected = set(positions)
+    for position, try_count in enumerate(tries):
+        if parent(position) in affected or (try_count > 1 and position - 1 in affected):
+            affected.add(position)
+    return affected

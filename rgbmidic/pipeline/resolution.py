@@ -17,14 +17,14 @@ import numpy as np
 
 from rgbmidic.correlation import Deformed, Solution, Status, TrackingState, discretisation_error, track
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
-from rgbmidic.fields import NodalCovariance, Places, StrainGauges
+from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refine_elements
 from rgbmidic.pipeline.frame import prepared_frame
+from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
-from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import FloatArray
 
@@ -38,7 +38,7 @@ noise by as much and the discretisation error of a smooth field by 4 (its third 
 Progress = Callable[[int, int, str], None]
 
 
-def sizes_to_try(plan: Plan, stated: Sequence[float] = ()) -> tuple[float, ...]:
+def sizes_to_try(plan: Plan, requested: Sequence[float] = ()) -> tuple[float, ...]:
     """The sizes that are stated, in rising order; else the `SIZES` that suit speckle and region.
 
     Those hold enough speckles, and enough lie across the region; the nearest to that if none does.
@@ -51,20 +51,20 @@ def sizes_to_try(plan: Plan, stated: Sequence[float] = ()) -> tuple[float, ...]:
         The region is too small for any.
     """
     spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
-    most = min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
-    least = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least)
-    if stated and max(stated) > most:
+    max_size = min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
+    min_size = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.min_size)
+    if requested and max(requested) > max_size:
         raise InputError(
-            f"elements of {max(stated):g} px are too large for the region: {most:.0f} px are the largest of which "
-            f"{CONSTANTS.fewest:g} lie across it"
+            f"elements of {max(requested):g} px are too large for the region: {max_size:.0f} px are the largest of "
+            f"which {CONSTANTS.fewest:g} lie across it"
         )
-    if not stated and most < CONSTANTS.least:
+    if not requested and max_size < CONSTANTS.min_size:
         raise RegionError(
-            f"the region is too small to compare element sizes: {CONSTANTS.fewest:g} elements of {CONSTANTS.least:g} "
-            "px must lie across it; state mesh.element_size"
+            f"the region is too small to compare element sizes: {CONSTANTS.fewest:g} elements of "
+            f"{CONSTANTS.min_size:g} px must lie across it; state mesh.element_size"
         )
-    suited = stated or [size for size in SIZES if least <= size <= most]
-    return tuple(sorted(suited)) or (float(np.floor(min(least, most))),)
+    suited = requested or [size for size in SIZES if min_size <= size <= max_size]
+    return tuple(sorted(suited)) or (float(np.floor(min(min_size, max_size))),)
 
 
 def study_sizes(
@@ -75,7 +75,7 @@ def study_sizes(
     frames: Sequence[int] = (),
     static: bool = True,
     progress: Progress | None = None,
-    **given: Any,
+    **objects: Any,
 ) -> ResolutionStudy:
     """Measure a deformed frame and the static frames of a test with elements of several sizes.
 
@@ -94,7 +94,7 @@ def study_sizes(
         Whether the noise floor is measured, where the reference is the mean of several frames.
     progress
         Called with the sizes done, their number and the next one.
-    **given
+    **objects
         Objects in place of what the settings name, as `rgbmidic.measure` takes them.
 
     Returns
@@ -107,13 +107,15 @@ def study_sizes(
         The settings or frames are not usable, there is no deformed frame, none of them can be measured, or a size or
         gauge does not fit.
     """
-    if settings.mesh.file is not None or given.get("mesh") is not None:
-        what = "a mesh is given" if settings.mesh.file is None else f"mesh.file names {settings.mesh.file}"
-        raise ConfigurationError(f"{what}, whose elements have their sizes: one is found for a mesh made here only")
-    if sizes and min(sizes) < CONSTANTS.least:
-        raise InputError(f"elements of {min(sizes):g} px are too small: {CONSTANTS.least:g} px are the least")
+    if settings.mesh.file is not None or objects.get("mesh") is not None:
+        mesh_source = "a mesh is given" if settings.mesh.file is None else f"mesh.file names {settings.mesh.file}"
+        raise ConfigurationError(
+            f"{mesh_source}, whose elements have their sizes: one is found for a mesh made here only"
+        )
+    if sizes and min(sizes) < CONSTANTS.min_size:
+        raise InputError(f"elements of {min(sizes):g} px are too small: {CONSTANTS.min_size:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
-    plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **given)
+    plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **objects)
     sizes = sizes_to_try(plan, sizes)
     lengths = [SHORTEST * size for size in sizes] if gauges is None else sorted(gauges)
     if lengths and max(lengths) < (shortest := SHORTEST * min(sizes) * (1 - CONSTANTS.equal)):
@@ -125,19 +127,19 @@ def study_sizes(
     report(0, len(sizes) + 1, "looking for the key frame")
     key = _KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[: CONSTANTS.static] if static and len(settings.frames.reference) > 1 else ()
-    rest = [_deformed(plan, index) for index in at_rest]
+    static_frames = [_deformed(plan, index) for index in at_rest]
     figures, finer = [], list[tuple[Tri3Mesh, Solution]]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
-            figures.append(key.figures(_resized(plan, size), rest, lengths, finer))
+            figures.append(key.figures(_resized(plan, size), static_frames, lengths, finer))
         except RgbmidicError as error:
             logger.warning("elements of %g px: %s", size, error)
             figures.append(SizeFigures(element_size=size, reason=str(error)))
     return ResolutionStudy(
         frame=key.index,
         name=plan.series.name(key.index),
-        static=len(rest),
+        static=len(static_frames),
         speckle=plan.speckle or float("nan"),
         preparation=key.seconds,
         sizes=_mesh_errors(figures),
@@ -146,8 +148,8 @@ def study_sizes(
 
 def rms(values: FloatArray) -> float:
     """Root mean square of the finite values; NaN where there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
@@ -157,31 +159,33 @@ def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution
 
 def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Displacement and strain (P, 5) at points (P, 2), and their noise without the misfit of the elements."""
-    places, nodal = Places.of(mesh, points), np.hstack([solution.displacement_std, solution.strain_std])
-    corners = mesh.elements[places.element]
-    noise = np.sqrt(np.einsum("pc,pci->pi", places.barycentric, nodal[corners] ** 2))
-    return places.read(np.hstack([solution.displacement, solution.strain])), noise
+    mesh_points, nodal = MeshPoints.of(mesh, points), np.hstack([solution.displacement_std, solution.strain_std])
+    corners = mesh.elements[mesh_points.element]
+    noise = np.sqrt(np.einsum("pc,pci->pi", mesh_points.barycentric, nodal[corners] ** 2))
+    return mesh_points.read(np.hstack([solution.displacement, solution.strain])), noise
 
 
-def _apart(
+def _excess_differences(
     mesh: Tri3Mesh, solution: Solution, finer: Sequence[tuple[Tri3Mesh, Solution]]
 ) -> tuple[list[float], list[float]]:
-    """How far a solution is from each of those on `finer` elements beyond the noise of both, at the nodes of those.
+    """Compute how far a solution is from each of those on `finer` elements beyond their noise, at the nodes of those.
 
     Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes of a
     study have measured it. Of displacement and strain.
     """
-    found: tuple[list[float], list[float]] = ([], [])
-    for fine, other in finer:
-        here, noise = _field_at(mesh, solution, fine.nodes)
-        square = (here - np.hstack([other.displacement, other.strain])) ** 2
-        variance = noise**2 + np.hstack([other.displacement_std, other.strain_std]) ** 2
-        for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
-            known = np.isfinite(square[:, part] + variance[:, part])
-            beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
-            plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
-            errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
-    return found
+    differences: tuple[list[float], list[float]] = ([], [])
+    for fine, fine_solution in finer:
+        values, noise = _field_at(mesh, solution, fine.nodes)
+        square = (values - np.hstack([fine_solution.displacement, fine_solution.strain])) ** 2
+        variance = noise**2 + np.hstack([fine_solution.displacement_std, fine_solution.strain_std]) ** 2
+        for errors, columns in zip(differences, (slice(2), slice(2, 5)), strict=True):
+            is_measured = np.isfinite(square[:, columns] + variance[:, columns])
+            excess, expected = (square - variance)[:, columns][is_measured], variance[:, columns][is_measured]
+            is_significant = excess.sum() > CONSTANTS.significance * np.sqrt(
+                2 * (expected**2).sum() / CONSTANTS.independent
+            )
+            errors.append(float(np.sqrt(excess.mean())) if is_significant else 0.0)
+    return differences
 
 
 def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]:
@@ -193,9 +197,9 @@ def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]
     if len(fields) < 2:
         return float("nan"), float("nan")
     stack = np.stack(fields)
-    apart = (stack - stack.mean(axis=0)) * np.sqrt(1 + 1 / references) * np.sqrt(len(fields) / (len(fields) - 1))
-    mean = np.nanmean(apart, axis=1, keepdims=True)
-    return rms(mean), rms(apart - mean)
+    deviations = (stack - stack.mean(axis=0)) * np.sqrt(1 + 1 / references) * np.sqrt(len(fields) / (len(fields) - 1))
+    mean = np.nanmean(deviations, axis=1, keepdims=True)
+    return rms(mean), rms(deviations - mean)
 
 
 def _gauge_figures(
@@ -209,12 +213,14 @@ def _gauge_figures(
     covariance = NodalCovariance.from_mesh(mesh)
     for length in fit:
         gauge = StrainGauges.at_nodes(covariance, length)
-        strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
+        strains = [
+            gauge.strain(*static.displacement.T, *static.displacement_std.T, measure=measure) for static in still
+        ]
         loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
-        floor = _floor([one.components for one in strains], len(plan.settings.frames.reference))[1]
+        floor = _floor([static.components for static in strains], len(plan.settings.frames.reference))[1]
         size = np.abs(loaded.components)
-        known = size[np.isfinite(size)]
-        largest = float(np.quantile(known, CONSTANTS.largest)) if known.size else float("nan")
+        finite = size[np.isfinite(size)]
+        largest = float(np.quantile(finite, CONSTANTS.largest)) if finite.size else float("nan")
         noise = floor if np.isfinite(floor) else rms(loaded.components_std)
         yield GaugeFigures(length=length, noise=noise, largest=largest)
 
@@ -225,28 +231,32 @@ def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
     A coarser mesh follows no more than a finer one: what falls as elements grow is none of the mesh's. It is, for
     instance, that of reflections, which each element averages.
     """
-    stated = np.array([[one.discretisation, one.strain.discretisation] for one in sizes])
-    mesh = np.where(np.isfinite(stated), np.fmin.accumulate(stated[::-1])[::-1], np.nan)
-    fallen = float(np.fmax.reduce(np.sqrt(np.maximum(stated**2 - mesh**2, 0.0))[:, 0], initial=0.0))
-    if fallen > max((one.noise for one in sizes if one.noise > 0), default=np.inf):
+    estimated = np.array([[figures.discretisation, figures.strain.discretisation] for figures in sizes])
+    mesh = np.where(np.isfinite(estimated), np.fmin.accumulate(estimated[::-1])[::-1], np.nan)
+    fallen = float(np.fmax.reduce(np.sqrt(np.maximum(estimated**2 - mesh**2, 0.0))[:, 0], initial=0.0))
+    if fallen > max((figures.noise for figures in sizes if figures.noise > 0), default=np.inf):
         logger.warning(
             f"differences of {fallen:.2g} px between element sizes fall as the elements grow, as those of reflections: "
             "they are not counted as the mesh's"
         )
     return tuple(
-        replace(one, discretisation=float(moved), strain=replace(one.strain, discretisation=float(strain)))
-        for one, (moved, strain) in zip(sizes, mesh, strict=True)
+        replace(
+            figures,
+            discretisation=float(displacement_error),
+            strain=replace(figures.strain, discretisation=float(strain)),
+        )
+        for figures, (displacement_error, strain) in zip(sizes, mesh, strict=True)
     )
 
 
-def choose(settings: TestSettings, **given: Any) -> Choice:
+def choose(settings: TestSettings, **objects: Any) -> Choice:
     """Find the element size of a test with ``mesh.element_size = "auto"``.
 
     It depends on the reference and the deformed frames alone, neither on time nor on the number of workers.
 
     Parameters
     ----------
-    settings, **given
+    settings, **objects
         As in `study_sizes`.
 
     Raises
@@ -255,12 +265,14 @@ def choose(settings: TestSettings, **given: Any) -> Choice:
         As `study_sizes`, or nothing is known of any size.
     """
     try:
-        study = study_sizes(settings, gauges=(), static=False, **given)
+        study = study_sizes(settings, gauges=(), static=False, **objects)
     except FrameError as error:
         raise FrameError(f'mesh.element_size = "auto": {error}; state a number') from error
     if (choice := study.choice) is None:
-        why = "; ".join(f"{one.element_size:g} px: {one.reason or 'not known'}" for one in study.sizes)
-        raise FrameError(f'mesh.element_size = "auto": no size can be judged in {study.name} ({why}); state a number')
+        reasons = "; ".join(f"{figures.element_size:g} px: {figures.reason or 'not known'}" for figures in study.sizes)
+        raise FrameError(
+            f'mesh.element_size = "auto": no size can be judged in {study.name} ({reasons}); state a number'
+        )
     logger.info("%s", choice.reason)
     return choice
 
@@ -292,16 +304,17 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         key = _KeyFrame.find(plan, () if frame is True else (int(frame),))
     except (FrameError, InputError) as error:
         raise type(error)(f"mesh.refine: {error}") from error
-    least, counts = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least), [len(plan.reference.mesh.nodes)]
+    min_leg, counts = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.min_size), [len(plan.reference.mesh.nodes)]
     while len(counts) <= CONSTANTS.passes:
         mesh = plan.reference.mesh
         solution = solved(plan, key.deformed, key.start(mesh))
-        known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
+        estimated = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
         missed, noise = (  # the squares at the corners of each element; NaN takes no part
-            np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
+            np.nan_to_num(values[mesh.elements] ** 2).sum(axis=(1, 2))
+            for values in (estimated.strain_error, estimated.strain_std)
         )
         unresolved = missed > CONSTANTS.worth**2 * noise
-        finer = refine_elements(mesh, unresolved, least)
+        finer = refine_elements(mesh, unresolved, min_leg)
         if finer is mesh:
             if unresolved.any():
                 worst = int(np.argmax(np.where(unresolved, missed, 0)))
@@ -312,8 +325,8 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
                         100 * mesh.areas[unresolved].sum() / mesh.areas.sum(),
                         *mesh.nodes[mesh.elements[worst]].mean(axis=0),
                     ),
-                    *(np.sqrt(part[worst] / 9) for part in (missed, noise)),  # three strains at three corners
-                    least,
+                    *(np.sqrt(values[worst] / 9) for values in (missed, noise)),  # three strains at three corners
+                    min_leg,
                 )
             break
         nodes = np.round(finer.nodes / CONSTANTS.exact) * CONSTANTS.exact
@@ -321,10 +334,10 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         counts.append(len(nodes))
     name = plan.series.name(key.index)
     worth = f"the discretisation error of strain in {name} is more than {CONSTANTS.worth:g} times its noise"
-    text = f"no element: there is none where {worth} and parts would have legs of {least:.3g} px or more"
+    text = f"no element: there is none where {worth} and parts would have legs of {min_leg:.3g} px or more"
     if counts[1:]:
         text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
-        text += f"than {least:.3g} px"
+        text += f"than {min_leg:.3g} px"
     logger.info("refined: %s", text)
     return replace(plan, notes={**plan.notes, "refinement": text})
 
@@ -342,17 +355,17 @@ class _KeyFrame:
     @classmethod
     def find(cls, plan: Plan, frames: Sequence[int]) -> _KeyFrame:
         """Measure some frames, and keep the one whose displacement departs most from an affine one."""
-        chosen, reference = plan.series.selected, plan.settings.frames.reference
+        selected, reference = plan.series.selected, plan.settings.frames.reference
         for index in frames:
-            if index not in chosen or index in reference:
-                what = "of the reference" if index in reference else f"not among {chosen[0]} to {chosen[-1]}"
-                raise InputError(f"frame {index} is {what}: a deformed frame of the test is needed")
-        all_ = [index for index in chosen if index not in reference]
-        if not all_:
+            if index not in selected or index in reference:
+                reason = "of the reference" if index in reference else f"not among {selected[0]} to {selected[-1]}"
+                raise InputError(f"frame {index} is {reason}: a deformed frame of the test is needed")
+        deformed_frames = [index for index in selected if index not in reference]
+        if not deformed_frames:
             raise FrameError("the test has no deformed frame, which shows what elements cannot follow")
-        spread = np.unique(np.linspace(0, len(all_) - 1, CONSTANTS.candidates + 1).round().astype(int)[1:])
-        found, most, reasons = None, -1.0, []
-        for index in frames or [all_[place] for place in spread]:
+        spread = np.unique(np.linspace(0, len(deformed_frames) - 1, CONSTANTS.candidates + 1).round().astype(int)[1:])
+        best, max_departure, reasons = None, -1.0, []
+        for index in frames or [deformed_frames[position] for position in spread]:
             before = time.process_time()
             try:
                 deformed = _deformed(plan, index)
@@ -364,21 +377,25 @@ class _KeyFrame:
                 logger.warning("frame %d (%s) is passed over: %s", index, plan.series.name(index), error)
                 reasons.append(f"{plan.series.name(index)}: {error}")
                 continue
-            if (rest := _beyond_affine(solution)) > most:
-                found, most = cls(index, deformed, plan.reference.mesh, solution, seconds), rest
-        if found is None:
+            if (departure := _nonaffine_rms(solution)) > max_departure:
+                best, max_departure = cls(index, deformed, plan.reference.mesh, solution, seconds), departure
+        if best is None:
             raise FrameError(f"no deformed frame can be measured: {'; '.join(reasons)}")
-        return found
+        return best
 
     def start(self, mesh: Tri3Mesh) -> FloatArray:
         """The displacement (N, 2) at the nodes of another mesh of the region."""
-        found = Places.of(self.mesh, mesh.observation_points)
-        whole = self.solution.displacement[self.mesh.nearest_nodes(self.solution.measured)[1]]
-        corners = whole[self.mesh.elements[found.element]]
-        return np.asarray(np.einsum("nc,nci->ni", found.barycentric, corners))
+        mesh_points = MeshPoints.of(self.mesh, mesh.observation_points)
+        filled_displacement = self.solution.displacement[self.mesh.nearest_nodes(self.solution.measured)[1]]
+        corners = filled_displacement[self.mesh.elements[mesh_points.element]]
+        return np.asarray(np.einsum("nc,nci->ni", mesh_points.barycentric, corners))
 
     def figures(
-        self, plan: Plan, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[tuple[Tri3Mesh, Solution]]
+        self,
+        plan: Plan,
+        static_frames: Sequence[Deformed],
+        gauges: Sequence[float],
+        finer: list[tuple[Tri3Mesh, Solution]],
     ) -> SizeFigures:
         """Measure the figures of the size of a plan's elements.
 
@@ -386,7 +403,7 @@ class _KeyFrame:
         ----------
         plan
             The test with elements of this size.
-        rest
+        static_frames
             Static frames.
         gauges
             Lengths of virtual strain gauges, px; those too short for the elements are left out.
@@ -399,30 +416,38 @@ class _KeyFrame:
         seconds = time.process_time() - before
         if solution.status is Status.FAILED:
             raise FrameError(solution.reason)
-        still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
-        known = discretisation_error(plan.reference, self.deformed, solution, plan.solver, plan.method)
-        other = [one for one in finer if CONSTANTS.finer * one[0].size <= mesh.size]
+        still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in static_frames]
+        estimated = discretisation_error(plan.reference, self.deformed, solution, plan.solver, plan.method)
+        comparable = [item for item in finer if CONSTANTS.finer * item[0].size <= mesh.size]
         # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
         # reflections, which every size averages in its own way, hardly differ from the next
-        part = [1 - (fine.size / mesh.size) ** 3 for fine, _ in other]
-        apart = [min(np.divide(found, part), default=0.0) for found in _apart(mesh, known, other)]
-        finer.append((mesh, known))
-        whole = solution.measured[mesh.elements].all(axis=1)
+        fractions = [1 - (fine.size / mesh.size) ** 3 for fine, _ in comparable]
+        excess = [
+            min(np.divide(difference, fractions), default=0.0)
+            for difference in _excess_differences(mesh, estimated, comparable)
+        ]
+        finer.append((mesh, estimated))
+        is_measured = solution.measured[mesh.elements].all(axis=1)
 
-        def errors(name: str, beyond: float) -> dict[str, Any]:
-            bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
-            stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
-            return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
+        def errors(name: str, size_difference: float) -> dict[str, Any]:
+            bias, scatter = _floor([getattr(item, name) for item in still], len(plan.settings.frames.reference))
+            std, error = (rms(getattr(estimated, f"{name}_{kind}")) for kind in ("std", "error"))
+            return {
+                "bias": bias,
+                "scatter": scatter,
+                "stated": std,
+                "discretisation": float(np.fmax(error, size_difference)),
+            }
 
         return SizeFigures(
             element_size=plan.element_size,
             speckles=plan.element_size / speckle,
             nodes=len(mesh.nodes),
-            measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
-            strain=ErrorFigures(**errors("strain", apart[1])),
+            measured=float(mesh.areas[is_measured].sum() / mesh.areas.sum()),
+            strain=ErrorFigures(**errors("strain", excess[1])),
             seconds=seconds,
             gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
-            **errors("displacement", apart[0]),
+            **errors("displacement", excess[0]),
         )
 
 
@@ -438,9 +463,9 @@ def _resized(plan: Plan, size: float) -> Plan:
     return replace(plan.on_mesh(Tri3Mesh.from_region(plan.region, size, cracks)), element_size=size)
 
 
-def _beyond_affine(solution: Solution) -> float:
-    """What no affine motion follows of a displacement: rms over the measured nodes, px."""
-    known = solution.measured
-    basis = np.column_stack([np.ones(known.sum()), solution.nodes[known]])
-    moved = solution.displacement[known]
-    return rms(np.asarray(moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]))
+def _nonaffine_rms(solution: Solution) -> float:
+    """Compute the rms of a displacement less its best affine motion, over the measured nodes, px."""
+    is_measured = solution.measured
+    basis = np.column_stack([np.ones(is_measured.sum()), solution.nodes[is_measured]])
+    displacement = solution.displacement[is_measured]
+    return rms(np.asarray(displacement - basis @ np.linalg.lstsq(basis, displacement, rcond=None)[0]))

@@ -17,13 +17,13 @@ from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
-from rgbmidic.pipeline.frame import Measured, Updated, checksum, messages, read_state
-from rgbmidic.pipeline.objects import check_object, check_type, describe
+from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
+from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
+from rgbmidic.pipeline.frame_quality import light_levels
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.source import FrameSequence
-from rgbmidic.pipeline.suitability import light_levels
+from rgbmidic.pipeline.user_objects import check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
@@ -35,7 +35,7 @@ from rgbmidic.weights import LightWeights
 logger = logging.getLogger(__name__)
 
 _OF_NODES = {
-    array: [one.name for one in QUANTITIES.values() if one.source.startswith(f"{array}.")]
+    array: [quantity.name for quantity in QUANTITIES.values() if quantity.source.startswith(f"{array}.")]
     for array in ("displacement", "displacement_std", "bias_std", "edge_std", "strain", "strain_std")
 }
 """Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
@@ -120,119 +120,121 @@ def measure(
     check_type("frames", frames, range | None, "a range of indices")
     check_type("workers", workers, int | None, "a whole number")
     check_object("progress", progress, "__call__")
-    given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
-    kept = read_provenance(Path(out)) if begun else {}
+    instances: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
+    is_begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
+    provenance = read_provenance(Path(out)) if is_begun else {}
     with collect_messages() as before:
-        plan = replace(_plan_of(settings, given, kept, Path(out)), timings=timings)
+        plan = replace(_plan_of(settings, instances, provenance, Path(out)), timings=timings)
     warnings = list(dict.fromkeys(text for level, text in before if level >= logging.WARNING))
     plan = replace(plan, notes={**plan.notes, "warnings": warnings})
-    objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
+    objects = {
+        name: describe(instance) for name, instance in instances.items() if instance is not None and name != "source"
+    }
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
-    places = _places(plan.series.selected, frames)
+    positions = _select_positions(plan.series.selected, frames)
     if workers is None:
         workers = threads() if separation is None and weights is None else 1
-    origin = _origin(plan, objects, kept.get("unread_files", ()))
+    origin = _origin(plan, objects, provenance.get("unread_files", ()))
     if frames is not None:
-        opened = ResultStore.join(out, origin, frames=places)
+        opened = ResultStore.join(out, origin, frames=positions)
     elif resume:
         opened = ResultStore.resume(out, origin)
     else:
         opened = ResultStore.create(out, origin, overwrite=overwrite)
     with opened as store:
         if resume and frames is None:
-            _take_back(plan, store, origin.names, retry_failed=retry_failed)
-        sink = _Folder(plan, store, places, progress)
-        schedule = Schedule(plan, sink, places)
+            _invalidate_frames(plan, store, origin.names, retry_failed=retry_failed)
+        sink = _ResultSink(plan, store, positions, progress)
+        schedule = Schedule(plan, sink, positions)
         if schedule.done and frames is None and "finished" in read_provenance(store.path):
             logger.warning("%s is finished and whole: nothing is left to be measured", out)
             return Result.open(out)
         store.reopen()
         if not schedule.done:
-            with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
-                schedule.run(others)
-        table = store.table().iterate(["status", "reason", "warnings"], places)
-        texts = ((place, messages(kept)) for place, kept in zip(places, table, strict=True))
+            with closing(open_workers(plan, min(workers, len(positions)), scheduler)) as pool:
+                schedule.run(pool)
+        table = store.table().iterate(["status", "reason", "warnings"], positions)
+        texts = ((position, messages(record)) for position, record in zip(positions, table, strict=True))
         for line in join_frame_warnings(texts, origin.names):
             logger.warning("%s", line)
-        with collect_messages() as together:
-            _tell_repeated(plan, store, places, origin.names)
+        with collect_messages() as collected:
+            _warn_duplicate_frames(plan, store, positions, origin.names)
         if frames is None:
-            store.finish([text for _, text in together])
+            store.finish([text for _, text in collected])
     return Result.open(out, partial=frames is not None, check=False)
 
 
-def _plan_of(settings: TestSettings, given: Mapping[str, Any], kept: Mapping[str, Any], out: Path) -> Plan:
-    """The plan of a test: elements and mesh are those of the provenance `kept` of a result that is gone on with."""
+def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: Mapping[str, Any], out: Path) -> Plan:
+    """Make the plan of a test: elements and mesh are those of the `provenance` of a result that is gone on with."""
     sized, notes = settings.mesh, dict[str, Any]()
     if sized.element_size == "auto":
-        choice = notes["element_size"] = kept.get("element_size") or asdict(choose(settings, **given))
+        choice = notes["element_size"] = provenance.get("element_size") or asdict(choose(settings, **instances))
         sized = replace(sized, element_size=choice["element_size"])
     refines = settings.mesh.refine is not False
-    if refines and given["mesh"] is not None:
+    if refines and instances["mesh"] is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
-    plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
-    if refines and "refinement" in kept:
-        stored = read_shared(out, kept)
+    plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **instances)
+    if refines and "refinement" in provenance:
+        stored = read_shared(out, provenance)
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-        plan, notes["refinement"] = plan.on_mesh(finer), kept["refinement"]
+        plan, notes["refinement"] = plan.on_mesh(finer), provenance["refinement"]
     elif refines:
         plan = refine(plan, settings.mesh.refine)
     return replace(plan, settings=settings, notes={**plan.notes, **notes})
 
 
-class _Folder:
+class _ResultSink:
     """The sink of a result folder."""
 
-    def __init__(self, plan: Plan, store: ResultStore, places: range, progress: Progress | None) -> None:
-        self._plan, self._store, self._places, self._progress = plan, store, places, progress
+    def __init__(self, plan: Plan, store: ResultStore, positions: range, progress: Progress | None) -> None:
+        self._plan, self._store, self._positions, self._progress = plan, store, positions, progress
         self._finished = store.finished()
 
-    def is_finished(self, place: int) -> bool:
-        """Whether a frame is in the folder."""
-        return bool(self._finished[place])
+    def is_finished(self, position: int) -> bool:
+        """Return whether a frame is in the folder."""
+        return bool(self._finished[position])
 
-    def start_after(self, place: int) -> TrackingState:
+    def start_after(self, position: int) -> TrackingState:
         """Initial guess after a finished frame: from the last that is measured up to there.
 
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
         """
         names = ("u", "v", "node_status", "reference_updates", "best_match")
-        for kept in self._store.table().iterate(names, range(place, -1, -1)):
-            if (kept["node_status"] == NodeStatus.MEASURED).any():
-                return following(self._plan, kept, TrackingState(displacement=None))
+        for values in self._store.table().iterate(names, range(position, -1, -1)):
+            if (values["node_status"] == NodeStatus.MEASURED).any():
+                return next_start(self._plan, values, TrackingState(displacement=None))
         return TrackingState(displacement=None)
 
-    def updated(self, places: Sequence[int]) -> Updated:
+    def updated(self, positions: Sequence[int]) -> ReferenceHistory:
         """Indices and solutions of the frames that became the reference, as the folder holds them."""
-        if not places:
+        if not positions:
             return ()
-        mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
-        blank, found = Solution.failed(mesh, lights, "", np.zeros(0)), []
+        mesh, lights, selected = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
+        blank, updates = Solution.failed(mesh, lights, "", np.zeros(0)), []
         names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
-        for place, kept in zip(places, self._store.table().iterate(names, places), strict=True):
-            arrays: dict[str, Any] = {"node_status": kept["node_status"], "rigid": kept["rigid"].astype(np.float64)}
-            for name, parts in _OF_NODES.items():
-                arrays[name] = np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
-            found.append((chosen[place], replace(blank, **arrays)))
-        return found
+        for position, values in zip(positions, self._store.table().iterate(names, positions), strict=True):
+            arrays: dict[str, Any] = {"node_status": values["node_status"], "rigid": values["rigid"].astype(np.float64)}
+            for name, columns in _OF_NODES.items():
+                arrays[name] = np.stack([values[column] for column in columns], axis=1, dtype=np.float64)
+            updates.append((selected[position], replace(blank, **arrays)))
+        return updates
 
-    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
+    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
         """Write a frame, and report what became of it."""
-        record, places = found.record, self._places
-        self._store.write_frame(place, record)
-        self._finished[place] = True
+        record, positions = outcome.record, self._positions
+        self._store.write_frame(position, record)
+        self._finished[position] = True
         if self._progress is None:
             return
-        done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
+        done, status = int(self._finished[positions.start : positions.stop].sum()), Status(record.status)
         line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
         if status is Status.CONVERGED:
             line = f"converged in {record.iterations} iterations, {1 - rank_of(record)[1]:.0%} of the nodes measured"
-        self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.selected[place])}: {line}")
+        self._progress(done, len(positions), f"{self._plan.series.name(self._plan.series.selected[position])}: {line}")
 
 
-def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_failed: bool) -> None:
+def _invalidate_frames(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_failed: bool) -> None:
     """Take back the frames that are to be measured again, and those whose bits depend on what becomes of them.
 
     A damaged frame comes back with the same bits, unless it had failed because it could not be read.
@@ -240,39 +242,43 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
     table = store.table()
     lost = np.flatnonzero(table.without_damaged(ended="finished" in read_provenance(store.path)).damaged).tolist()
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
-    for place, there in enumerate(table.finished.tolist()):
+    for position, is_finished in enumerate(table.finished.tolist()):
         try:
-            kept = next(table.iterate(["status", "unread", "tries"], [place] if there else []))
+            values = next(table.iterate(["status", "unread", "tries"], [position] if is_finished else []))
         except (ResultError, StopIteration):  # damaged, or not there: whatever it was
-            changed.append(place)
+            changed.append(position)
             continue
-        tries[place] = kept["tries"]
-        if kept["unread"]:
+        tries[position] = values["tries"]
+        if values["unread"]:
             with suppress(FrameError):
-                read_state(plan, plan.series.selected[place])
-                readable.append(place)
+                read_state(plan, plan.series.selected[position])
+                readable.append(position)
                 continue
-        if retry_failed and kept["status"] == Status.FAILED:
-            changed.append(place)
+        if retry_failed and values["status"] == Status.FAILED:
+            changed.append(position)
     if lost:
         logger.warning("lost to damage and measured again: %s", list_frames(lost, names))
     if readable:
-        again_for = list_frames(readable, names)
-        logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
+        readable_frames = list_frames(readable, names)
+        logger.warning("measured again with what started from it, since it can be read now: %s", readable_frames)
     store.discard({*lost, *dependants([*changed, *readable], tries)})
 
 
-def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequence[str]) -> None:
+def _warn_duplicate_frames(plan: Plan, store: ResultStore, positions: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before or of the reference, bit for bit."""
-    sums = [kept["checksum"] for kept in store.table().iterate(["checksum"], places)]
-    pairs = zip(places[1:], sums[1:], sums, strict=False)
-    repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
-    chosen, references = plan.series.selected, plan.settings.frames.reference
-    measured = dict(zip(chosen[places.start : places.stop], sums, strict=True))
+    sums = [values["checksum"] for values in store.table().iterate(["checksum"], positions)]
+    pairs = zip(positions[1:], sums[1:], sums, strict=False)
+    repeated = [position for position, crc, before in pairs if crc == before != NO_CHECKSUM]
+    selected, references = plan.series.selected, plan.settings.frames.reference
+    measured = dict(zip(selected[positions.start : positions.stop], sums, strict=True))
     with suppress(FrameError):
-        of_reference = {measured.get(one) or checksum(read_state(plan, one, plan.window)[0]) for one in references}
-        copies = [place for place, mine in zip(places, sums, strict=True) if mine in of_reference - {NO_CHECKSUM}]
-        copies = [place for place in copies if chosen[place] not in references and place not in repeated]
+        of_reference = {
+            measured.get(index) or checksum(read_state(plan, index, plan.window)[0]) for index in references
+        }
+        copies = [
+            position for position, crc in zip(positions, sums, strict=True) if crc in of_reference - {NO_CHECKSUM}
+        ]
+        copies = [position for position in copies if selected[position] not in references and position not in repeated]
         if copies:
             logger.warning(
                 "frames are the reference, bit for bit, which camera noise makes impossible; their displacement of 0 "
@@ -280,14 +286,14 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequenc
                 list_frames(copies, names),
             )
     if repeated:
-        what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
+        subject = "all frames repeat" if len(repeated) == len(positions) - 1 else "frames that repeat"
         logger.warning(
-            f"{what} the one before, bit for bit, which camera noise makes impossible: {list_frames(repeated, names)}; "
-            "were frames lost and filled up, or files copied?"
+            f"{subject} the one before, bit for bit, which camera noise makes impossible: "
+            f"{list_frames(repeated, names)}; were frames lost and filled up, or files copied?"
         )
 
 
-def _places(chosen: range, frames: range | None) -> range:
+def _select_positions(selected: range, frames: range | None) -> range:
     """Places in the result of the frames that are to be measured.
 
     Raises
@@ -295,16 +301,17 @@ def _places(chosen: range, frames: range | None) -> range:
     FrameError
         There is none of them.
     """
-    places = [place for place, index in enumerate(chosen) if frames is None or index in frames]
-    if frames is not None and (not places or frames.stop > chosen[-1] + 1):
+    positions = [position for position, index in enumerate(selected) if frames is None or index in frames]
+    if frames is not None and (not positions or frames.stop > selected[-1] + 1):
         raise FrameError(
-            f"--frames names {frames.start} to {frames.stop - 1}; the test has the frames {chosen[0]} to {chosen[-1]}"
+            f"--frames names {frames.start} to {frames.stop - 1}; the test has the frames {selected[0]} to "
+            f"{selected[-1]}"
         )
-    return range(places[0], places[-1] + 1)
+    return range(positions[0], positions[-1] + 1)
 
 
 def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[str]) -> Origin:
-    """What the result keeps of what all frames share; `objects` are descriptions of those that were given."""
+    """Return what a result keeps of all frames in common; `objects` describes the objects that a script gave."""
     series, recording = plan.series, plan.series.recording
     fingerprint, unread = series.fingerprint(unread_before)
     levels = light_levels(plan.images, plan.region).items()
@@ -319,7 +326,9 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
         settings=plan.settings,
         inputs={" + ".join(plan.settings.frames.path) or "source": fingerprint, **objects},
         readers=getattr(series, "packages", ()),
-        references=[place for place, index in enumerate(series.selected) if index in plan.settings.frames.reference],
+        references=[
+            position for position, index in enumerate(series.selected) if index in plan.settings.frames.reference
+        ],
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
@@ -332,8 +341,8 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
             "reference_exposure": [
-                {"light": light, "median": level, "excluded": float(1 - part)}
-                for (light, level), part in zip(levels, usable, strict=True)
+                {"light": light, "median": level, "excluded": float(1 - fraction)}
+                for (light, level), fraction in zip(levels, usable, strict=True)
             ],
         },
     )

@@ -35,9 +35,9 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
-from rgbmidic.pipeline.frame import Measured, messages, next_reference
-from rgbmidic.pipeline.objects import check_object, check_type
+from rgbmidic.pipeline.frame import FrameOutcome, messages, next_reference
 from rgbmidic.pipeline.plan import STRIDE, Plan
+from rgbmidic.pipeline.user_objects import check_object, check_type
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
 from rgbmidic.typing import FloatArray
@@ -120,21 +120,23 @@ def correlate(
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
     solver = solver_settings(options)
-    given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
-    second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
-    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter, brightness=solver.brightness)
+    light_weights = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
+    second = aside(Deformed.prepare, g, light_weights[1], prefilter=solver.prefilter)
+    first = Reference.prepare(
+        f, region, light_weights[0], mesh=mesh, prefilter=solver.prefilter, brightness=solver.brightness
+    )
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     check_object("statistics", method, "precision")
     start = TrackingState(displacement=initial_displacement(initial, len(mesh.nodes)))
     solution = track(first, second.result(), start, solver, method)
     if solution.disagreement:
         logger.warning("%s", solution.disagreement)
-    found = solution
+    tracked = solution
     if mesh_error:
-        solution = discretisation_error(first, second.result(), found, solver, method)
+        solution = discretisation_error(first, second.result(), tracked, solver, method)
     else:
-        solution = with_one_sided_error(mesh, found)
-    if unresolved := unresolved_strain(mesh, found, solution):
+        solution = with_one_sided_error(mesh, tracked)
+    if unresolved := unresolved_strain(mesh, tracked, solution):
         logger.warning("%s", unresolved)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
@@ -245,17 +247,17 @@ def measure_sequence(
     if not np.iterable(states):
         raise InputError(f"the states are images, one after the other, not {states!r}")
     remaining = iter(states)
-    own = reference is None
-    if own and (reference := next(remaining, None)) is None:
+    reference_in_states = reference is None
+    if reference_in_states and (reference := next(remaining, None)) is None:
         raise InputError("there is no state to measure: the sequence is empty")
-    latest = _Latest(reference=reference, light_images=settings is None)
+    latest = _LatestFrameSource(reference=reference, light_images=settings is None)
     mask = region if isinstance(region, Region) else None
     if settings is None:
         if np.ndim(values := getattr(reference, "values", reference)) < 2:
             raise InputError(f"the reference is an image (H, W) or one of each light (k, H, W), not {reference!r}")
         height, width = np.shape(values)[-2:]
-        stated: Any = (0, 0, width - 1, height - 1) if region is None or mask is not None else region
-        corners = tuple(stated) if np.iterable(stated) else stated
+        rectangle: Any = (0, 0, width - 1, height - 1) if region is None or mask is not None else region
+        corners = tuple(rectangle) if np.iterable(rectangle) else rectangle
         settings = TestSettings(
             frames=sections.FrameSettings(path=(), update_reference=update_reference),
             region=sections.RegionSettings(rectangle=corners),
@@ -264,20 +266,20 @@ def measure_sequence(
             solver=solver_settings(options),
         )
     elif options or region is not None:
-        told = ", ".join([*options, *(["region"] if region is not None else [])])
-        raise InputError(f"settings are given: state in them what {told} says")
+        option_names = ", ".join([*options, *(["region"] if region is not None else [])])
+        raise InputError(f"settings are given: state in them what {option_names} says")
     if settings.weights.threshold == "auto":
         raise InputError('weights.threshold = "auto" looks at the first deformed frame, which a sequence has not yet')
     counted: Any = weights if weights is None or hasattr(weights, "deformed") else MaskWeights(cast(Any, weights))
-    frames = replace(settings.frames, reference=(0,), first=0 if own else 1, last=None, step=1)
+    frames = replace(settings.frames, reference=(0,), first=0 if reference_in_states else 1, last=None, step=1)
     plan = Plan.from_settings(
         replace(settings, frames=frames), source=latest, separation=separation, weights=counted, mesh=mesh, region=mask
     )
-    return _solutions(plan, latest, chain([reference], remaining) if own else remaining)
+    return _solutions(plan, latest, chain([reference], remaining) if reference_in_states else remaining)
 
 
 @dataclass(slots=True)
-class _Latest:
+class _LatestFrameSource:
     """A frame source of the reference, frame 0, and of the latest state, whatever its number."""
 
     reference: Any
@@ -297,17 +299,17 @@ class _Latest:
         return images.astype(np.float32)
 
 
-def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
+def _solutions(plan: Plan, latest: _LatestFrameSource, states: Iterable[Any]) -> Iterator[Solution]:
     """The solution of each state, in the order and with the second tries of `Schedule`."""
-    live = _Live(plan)
-    schedule, worker = Schedule(plan, live), Threads(plan, 1)
-    for place, latest.state in enumerate(states):
-        schedule.want(place)
+    sink = _SequenceSink(plan)
+    schedule, worker = Schedule(plan, sink), Threads(plan, 1)
+    for position, latest.state in enumerate(states):
+        schedule.want(position)
         schedule.run(worker)
-        yield live.solution
+        yield sink.solution
 
 
-class _Live:
+class _SequenceSink:
     """The sink of a sequence: the latest solution, and of all states before it what a later one may start from."""
 
     def __init__(self, plan: Plan) -> None:
@@ -316,38 +318,38 @@ class _Live:
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
 
-    def is_finished(self, place: int) -> bool:
-        """Whether it is one of those that are kept."""
-        return place in self._starts
+    def is_finished(self, position: int) -> bool:
+        """Return whether the start of a state is kept."""
+        return position in self._starts
 
-    def start_after(self, place: int) -> TrackingState:
+    def start_after(self, position: int) -> TrackingState:
         """Initial guess of the states that follow one."""
-        return self._starts[place]
+        return self._starts[position]
 
-    def updated(self, places: Sequence[int]) -> ReferenceUpdate:
+    def updated(self, positions: Sequence[int]) -> ReferenceUpdate:
         """The reference that states made, while they were there."""
-        return self._updates[tuple(places)]
+        return self._updates[tuple(positions)]
 
-    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
+    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
         """Take a state's solution, and forget what no later state starts from."""
-        plan, record = self._plan, found.record
+        plan, record = self._plan, outcome.record
         mesh, lights = plan.reference.mesh, len(plan.images.names)
-        self.solution = found.solution or Solution.failed(mesh, lights, record.reason, np.zeros(0))
+        self.solution = outcome.solution or Solution.failed(mesh, lights, record.reason, np.zeros(0))
         checksum = record.values["checksum"]
         if checksum == self._checksum != NO_CHECKSUM:
-            logger.warning("state %d repeats the one before, bit for bit", place)
-        elif plan.series.selected[place] in plan.settings.frames.reference:
+            logger.warning("state %d repeats the one before, bit for bit", position)
+        elif plan.series.selected[position] in plan.settings.frames.reference:
             self._of_reference.add(checksum)
         elif checksum in self._of_reference - {NO_CHECKSUM}:
-            logger.warning("state %d is the reference, bit for bit: its displacement of 0 is not measured", place)
+            logger.warning("state %d is the reference, bit for bit: its displacement of 0 is not measured", position)
         self._checksum = checksum
         for text in messages(record.values):
-            logger.warning("state %d: %s", place, text)
-        self._starts[place] = after
-        if (last := after.reference_updates[-1:]) not in self._updates:
-            self._updates[last] = next_reference(plan, self._updates[()], plan.series.selected[place], self.solution)
+            logger.warning("state %d: %s", position, text)
+        self._starts[position] = initial_guess
+        if (last := initial_guess.reference_updates[-1:]) not in self._updates:
+            self._updates[last] = next_reference(plan, self._updates[()], plan.series.selected[position], self.solution)
         # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
-        needed = {place // STRIDE**power * STRIDE**power for power in range(20)}
-        self._starts = {one: start for one, start in self._starts.items() if one in needed}
-        kept = {(), *(start.reference_updates[-1:] for start in self._starts.values())}
-        self._updates = {frames: one for frames, one in self._updates.items() if frames in kept}
+        needed = {position // STRIDE**power * STRIDE**power for power in range(20)}
+        self._starts = {item: start for item, start in self._starts.items() if item in needed}
+        needed_updates = {(), *(start.reference_updates[-1:] for start in self._starts.values())}
+        self._updates = {frames: item for frames, item in self._updates.items() if frames in needed_updates}

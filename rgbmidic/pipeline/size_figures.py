@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.pipeline.frame_quality import SPECKLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,7 +15,7 @@ class ResolutionConstants:
 
     Attributes
     ----------
-    least
+    min_size
         Smallest elements, px (`Tri3Mesh.from_region`).
     fewest
         Elements across the region: fewer have no node with neighbours on all sides, and no virtual strain gauge.
@@ -41,15 +41,15 @@ class ResolutionConstants:
     measured
         Area that a size must measure, of the size that measures most: what it loses is where its error would be the
         largest, such as a steep bump beside one node. Chosen: a node of elements of 40 px on 250 px is 8 %.
-    alike
+    tie_factor
         Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate
         of the discretisation error is no better than that.
-    sure, independent
+    significance, independent
         Standard deviations by which the mean square of a difference must exceed that of noise, and independent values
         in a nodal one, whose neighbours are correlated. Chosen.
     """
 
-    least: float = 4.0
+    min_size: float = 4.0
     fewest: float = 3.0
     candidates: int = 5
     static: int = 5
@@ -59,10 +59,10 @@ class ResolutionConstants:
     passes: int = 3
     worth: float = 2.0
     exact: float = 2.0**-16
-    sure: float = 2.0
+    significance: float = 2.0
     independent: float = 0.5
     measured: float = 0.97
-    alike: float = 1.05
+    tie_factor: float = 1.05
 
 
 CONSTANTS = ResolutionConstants()
@@ -187,27 +187,38 @@ class ResolutionStudy:
     @property
     def choice(self) -> Choice | None:
         """The size of the least total error among those that hold and measure enough; None where none is known."""
-        most = max((one.measured for one in self.sizes), default=0.0)
-        few = [one for one in self.sizes if one.speckles < SPECKLES]
-        usable = [one for one in self.sizes if one not in few and one.measured >= CONSTANTS.measured * most]
-        usable = sorted((one for one in usable if np.isfinite(one.total)), key=lambda one: one.element_size)
+        max_measured = max((figures.measured for figures in self.sizes), default=0.0)
+        too_small = [figures for figures in self.sizes if figures.speckles < SPECKLES]
+        usable = [
+            figures
+            for figures in self.sizes
+            if figures not in too_small and figures.measured >= CONSTANTS.measured * max_measured
+        ]
+        usable = sorted(
+            (figures for figures in usable if np.isfinite(figures.total)), key=lambda figures: figures.element_size
+        )
         if not usable:
             return None
-        least = min(one.total for one in usable)
+        min_total = min(figures.total for figures in usable)
         best = min(
-            (one for one in usable if one.total <= CONSTANTS.alike * least),
-            key=lambda one: np.nan_to_num(one.strain.total, nan=np.inf),
+            (figures for figures in usable if figures.total <= CONSTANTS.tie_factor * min_total),
+            key=lambda figures: np.nan_to_num(figures.strain.total, nan=np.inf),
         )
         smaller, larger = usable[: usable.index(best)][-1:], usable[usable.index(best) + 1 :][:1]
-        lead = "the least" if best.total == least else "within 5 % of the least"
-        parts = [
+        lead = "the least" if best.total == min_total else "within 5 % of the least"
+        sentences = [
             f"elements of {best.element_size:g} px have {lead} total error in {self.name}: {best.total:.2g} px, from "
             f"noise of {best.noise:.2g} px and a discretisation error of {best.discretisation:.2g} px"
         ]
-        for one, what in (*((one, "noise") for one in smaller), *((one, "discretisation error") for one in larger)):
-            value = one.noise if what == "noise" else one.discretisation
-            parts.append(f"with {one.element_size:g} px it is {one.total:.2g} px, for a {what} of {value:.2g} px")
-        if few:
-            names = ", ".join(f"{one.element_size:g}" for one in few)
-            parts.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
-        return Choice(element_size=best.element_size, reason="; ".join(parts))
+        for figures, error_name in (
+            *((figures, "noise") for figures in smaller),
+            *((figures, "discretisation error") for figures in larger),
+        ):
+            value = figures.noise if error_name == "noise" else figures.discretisation
+            sentences.append(
+                f"with {figures.element_size:g} px it is {figures.total:.2g} px, for a {error_name} of {value:.2g} px"
+            )
+        if too_small:
+            names = ", ".join(f"{figures.element_size:g}" for figures in too_small)
+            sentences.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
+        return Choice(element_size=best.element_size, reason="; ".join(sentences))

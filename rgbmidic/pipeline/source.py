@@ -24,7 +24,7 @@ from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame
 from rgbmidic.frames.series import FrameSeries, open_series, selected_frames
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
-from rgbmidic.pipeline.objects import class_name, describe
+from rgbmidic.pipeline.user_objects import class_name, describe
 from rgbmidic.settings import FrameSettings, TestSettings
 
 logger = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class SourceSeries:
     ----------
     source
         The frames.
-    stated
+    user_metadata
         What ``[frames]`` says of them.
     camera
         What a calibration knows of them.
@@ -86,7 +86,7 @@ class SourceSeries:
     """
 
     source: FrameSequence
-    stated: FrameSettings
+    user_metadata: FrameSettings
     camera: CameraMetadata | None = field(default=None, compare=False, repr=False)
     selected: range = range(0)
     n_lost: ClassVar[int] = 0
@@ -104,13 +104,13 @@ class SourceSeries:
 
     @property
     def recording(self) -> Recording:
-        """When the frames were taken, where the source knows it."""
+        """Return when the frames were taken, where the source knows it."""
         times = getattr(self.source, "times_ns", None)
         return Recording(count=len(self), times_ns=None if times is None else np.asarray(times, dtype=np.int64))
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a user should know of the times."""
+        """Return what a user should know of the times."""
         return tuple(f"{class_name(self.source)}: {remark}" for remark in self.recording.remarks)
 
     def read(self, index: int, window: Window | None = None) -> RawState:
@@ -126,8 +126,8 @@ class SourceSeries:
         except RgbmidicError:
             raise
         except Exception as error:  # of whatever library it is
-            told = f"{type(error).__name__}: {error}"
-            raise FrameError(f"{self.name(index)} cannot be read from {class_name(self.source)}: {told}") from error
+            message = f"{type(error).__name__}: {error}"
+            raise FrameError(f"{self.name(index)} cannot be read from {class_name(self.source)}: {message}") from error
         return self._state(state, self.name(index))
 
     def missing_lights(self) -> str:
@@ -135,12 +135,12 @@ class SourceSeries:
         return ""
 
     def name(self, index: int) -> str:
-        """What the source calls the frame, else its number."""
+        """Return what the source calls the frame, else its number."""
         names = getattr(self.source, "names", None)
         return f"frame {index}" if names is None else str(names[index])
 
     def time_ns(self, index: int) -> int | None:
-        """When the frame was taken, where the source knows it."""
+        """Return when the frame was taken, where the source knows it."""
         times = self.recording.times_ns
         return None if times is None else int(times[index])
 
@@ -149,59 +149,65 @@ class SourceSeries:
         return {}
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
-        """What `describe` gives for the source.
+        """Return what `describe` gives for the source.
 
         Without a description of its own, the content of the first frame of the reference and of the last frame chosen
         belongs to it.
         """
         if hasattr(self.source, "describe"):
             return describe(self.source), ()
-        told, without = f"{class_name(self.source)} of {len(self)} frames", []
-        for index in (self.stated.reference[0], self.selected[-1]):
+        description, without = f"{class_name(self.source)} of {len(self)} frames", []
+        for index in (self.user_metadata.reference[0], self.selected[-1]):
             name, content = self.name(index), "unread"
             if name not in unread:
                 with suppress(FrameError):
                     state = self.read(index)
-                    parts = [state] if isinstance(state, IlluminationImages) else state
-                    content = hashlib.sha256(b"".join(part.values.tobytes() for part in parts)).hexdigest()[:16]
+                    frames = [state] if isinstance(state, IlluminationImages) else state
+                    content = hashlib.sha256(b"".join(frame.values.tobytes() for frame in frames)).hexdigest()[:16]
             if content == "unread":
                 without.append(name)
-            told += f", {content}"
-        return told, tuple(without)
+            description += f", {content}"
+        return description, tuple(without)
 
     def _state(self, state: Any, name: str) -> RawState:
-        """What the source gives, as the pipeline takes it."""
+        """Convert a state of the source to raw frames or images of the lights; refuse anything else."""
         if isinstance(state, IlluminationImages):
             return state
         states = tuple(state) if isinstance(state, tuple | list) else (state,)
-        if states and all(isinstance(one, Mosaic | ChannelFrame) for one in states):
+        if states and all(isinstance(frame, Mosaic | ChannelFrame) for frame in states):
             return states
-        values, where = unmasked(state), f"{name} of {class_name(self.source)}"
+        values, label = unmasked(state), f"{name} of {class_name(self.source)}"
         kind = values.dtype.kind
         if kind == "f" and np.asarray(state).dtype.kind in "ui":
             raise FrameError(
-                f"{where} has masked samples, which a raw frame cannot have: give it saturated there, or images of the "
+                f"{label} has masked samples, which a raw frame cannot have: give it saturated there, or images of the "
                 "lights as floats"
             )
         if kind not in "uif" or values.ndim not in (2, 3) or not values.size:
             raise FrameError(
-                f"{where} is {values.dtype} of shape {values.shape}; allowed are whole numbers (H, W) or (C, H, W), "
+                f"{label} is {values.dtype} of shape {values.shape}; allowed are whole numbers (H, W) or (C, H, W), "
                 "floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
             )
         values = values.reshape(-1, *values.shape[-2:])
         if kind != "f":
             if values.dtype not in (np.uint8, np.uint16) and (values.min() < 0 or values.max() > 65535):
-                raise FrameError(f"{where} has grey levels outside 0 to 65535")
+                raise FrameError(f"{label} has grey levels outside 0 to 65535")
             samples = values if values.dtype == np.uint8 else values.astype(np.uint16, copy=False)
             channels_last = np.ascontiguousarray(np.moveaxis(samples, 0, -1))
             return (
-                raw_frame(StoredFrame.from_samples(channels_last, Path(name)), self.stated, Path(name), self.camera),
+                raw_frame(
+                    StoredFrame.from_samples(channels_last, Path(name)), self.user_metadata, Path(name), self.camera
+                ),
             )
-        stated = {"frames.kind": self.stated.kind, "frames.cfa": self.stated.cfa, "calibration.file": self.camera}
-        of_raw = [key for key, value in stated.items() if value not in (None, "monochrome")]
+        raw_settings = {
+            "frames.kind": self.user_metadata.kind,
+            "frames.cfa": self.user_metadata.cfa,
+            "calibration.file": self.camera,
+        }
+        of_raw = [key for key, value in raw_settings.items() if value not in (None, "monochrome")]
         if of_raw:
             raise ConfigurationError(
-                f"{where} is {values.dtype}: arrays of floats are images of the lights, and {' and '.join(of_raw)} "
+                f"{label} is {values.dtype}: arrays of floats are images of the lights, and {' and '.join(of_raw)} "
                 f"{'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give whole numbers, which are raw "
                 "frames, or leave that out"
             )
@@ -232,9 +238,9 @@ def open_frames(settings: TestSettings, source: FrameSequence | Series | None, c
 
 
 def _opened(settings: TestSettings, source: FrameSequence | Series | None, camera: CameraMetadata | None) -> Series:
-    stated = settings.frames
+    frame_settings = settings.frames
     if source is None:
-        return open_series(stated, settings.base, camera)
+        return open_series(frame_settings, settings.base, camera)
     members = {name for name in set(dir(FrameSeries)) & set(dir(SourceSeries)) if not name.startswith("_")}
     if all(hasattr(source, name) for name in members):  # also by `__getattr__` of a wrapper
         return cast(Series, source)
@@ -244,13 +250,19 @@ def _opened(settings: TestSettings, source: FrameSequence | Series | None, camer
             "not. Frames that come one after the other are for rgbmidic.measure_sequence"
         )
     for name in ("names", "times_ns"):
-        told = getattr(source, name, None)
-        if told is not None and len(told) != len(source):
-            raise InputError(f"{name} of {class_name(source)} has {len(told)} entries for {len(source)} frames")
-    chosen, start = selected_frames(stated, len(source)), stated.reference[0]
-    series = SourceSeries(source=cast(FrameSequence, source), stated=stated, camera=camera, selected=chosen)
+        entries = getattr(source, name, None)
+        if entries is not None and len(entries) != len(source):
+            raise InputError(f"{name} of {class_name(source)} has {len(entries)} entries for {len(source)} frames")
+    selected, start = selected_frames(frame_settings, len(source)), frame_settings.reference[0]
+    series = SourceSeries(
+        source=cast(FrameSequence, source), user_metadata=frame_settings, camera=camera, selected=selected
+    )
     state = series.read(start)
     if not isinstance(state, IlluminationImages):
         return replace(series, shape=state[0].values.shape[-2:])
-    white = float(np.nanmax(state.values, initial=0.0)) if stated.white_level is None else stated.white_level
-    return replace(series, shape=state.shape, full_scale=white - (stated.black_level or 0.0))
+    white = (
+        float(np.nanmax(state.values, initial=0.0))
+        if frame_settings.white_level is None
+        else frame_settings.white_level
+    )
+    return replace(series, shape=state.shape, full_scale=white - (frame_settings.black_level or 0.0))

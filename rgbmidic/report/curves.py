@@ -312,7 +312,7 @@ def profile_figure(profile: Profile, wave: Wave | None = None, curve_rows: Seque
         style.add_colour_bar(map_axis, norm, colours, values=finite_values)
         map_axis.set_title(field)
         if wave is not None:
-            used_positions = wave.front.used
+            used_positions = wave.front.is_fitted
             points = factor * wave.arrivals.times[used_positions], profile.positions[used_positions]
             bars = 2 * factor * wave.arrivals.std[used_positions]
             map_axis.errorbar(

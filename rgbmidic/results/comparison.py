@@ -25,7 +25,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import NodalCovariance, Places, StrainGauges, strain_of_gradient
+from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
@@ -347,9 +347,9 @@ class Comparison:
         return nodes if len(np.unique(nodes[nodes >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
 
     @cached_property
-    def _simulation_points(self) -> Places:
+    def _simulation_points(self) -> MeshPoints:
         """The simulation's nodes in the measurement's mesh."""
-        points = Places.of(self.mesh, self.simulation.mesh.points)
+        points = MeshPoints.of(self.mesh, self.simulation.mesh.points)
         if not points.inside.any():
             raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
         return points

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
@@ -383,11 +383,11 @@ class Maps(Portable):
         return points.read(values), triangles
 
     @cached_property
-    def _subdivision(self) -> tuple[Places, npt.NDArray[np.int32]]:
+    def _subdivision(self) -> tuple[MeshPoints, npt.NDArray[np.int32]]:
         mesh = self.physical.mesh
-        return Places.parts(mesh, int(np.clip((_PICTURE_TRIANGLES / len(mesh.elements)) ** 0.5, 1, 4)))
+        return MeshPoints.subdivide(mesh, int(np.clip((_PICTURE_TRIANGLES / len(mesh.elements)) ** 0.5, 1, 4)))
 
-    def points_in_elements(self, points: FloatArray, element: IntArray) -> Places:
+    def points_in_elements(self, points: FloatArray, element: IntArray) -> MeshPoints:
         """Take points of the image whose elements are known, to read nodal values there.
 
         Parameters
@@ -399,9 +399,9 @@ class Maps(Portable):
 
         Returns
         -------
-        Places
+        MeshPoints
         """
-        return Places.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
+        return MeshPoints.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
 
     def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
         """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.
@@ -424,7 +424,9 @@ class Maps(Portable):
         InputError
             The place is outside the mesh, or the gauge is too short.
         """
-        return strain_by_name(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
+        return strain_by_name(
+            self._strain_of(frame, self._gauge(*self.physical.rectified.probe_coordinates((x, y, length), 1)))
+        )
 
     @cached_property
     def _gauge(self) -> Callable[[float, float, float], StrainGauges]:

@@ -98,7 +98,9 @@ class Profile:
         self.frames = np.asarray(frames, dtype=np.int64)
         if not len(self.frames):
             raise InputError(f"no frame of {result.path} is measured yet")
-        self.line = ProfileLine(physical.covariance, physical.gauges, *physical.rectified.place(endpoints, 2))
+        self.line = ProfileLine(
+            physical.covariance, physical.gauges, *physical.rectified.probe_coordinates(endpoints, 2)
+        )
         times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
@@ -170,9 +172,9 @@ class Profile:
             "common_fraction": 0.0 if self.rate_window else self.common_fraction,
             "between_frames": frame_correlation,
         }
-        arrivals = arrival_times(clock, self.values, self.std, what=feature, level=level, **options)
+        arrivals = arrival_times(clock, self.values, self.std, feature=feature, level=level, **options)
         correlation = self.line.correlation(self.covariance_key, float(self.bias_fractions.mean()))
-        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **options)
+        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.is_two_sided, **options)
         scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
         front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))
         return Wave(feature=feature, level=level, arrivals=arrivals, front=front)
@@ -261,7 +263,7 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
         f"arrival_{clock}": wave.arrivals.times,
         f"arrival_{clock}_std": wave.arrivals.std,
         f"residual_{clock}": wave.front.residuals,
-        "used": wave.front.used.astype(float),
+        "used": wave.front.is_fitted.astype(float),
     }
     write_complete(
         arrivals_path, lambda file: write_table(file, columns, np.column_stack([*columns.values()]).tolist())

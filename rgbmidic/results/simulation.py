@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
@@ -298,7 +298,7 @@ class Levelling:
         # of their number, and is 1 % of what levelling changes at 3 (derived)
         sub_points = _subcentroids(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
         points = np.einsum("qc,ecd->eqd", sub_points, mesh.nodes[mesh.elements])
-        points_in_simulation = Places.of(simulated, points.reshape(-1, 2))
+        points_in_simulation = MeshPoints.of(simulated, points.reshape(-1, 2))
         # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
         depth: FloatArray = np.asarray(points_in_simulation.barycentric.min(axis=1)).reshape(points.shape[:2])
         is_covered: BoolArray = np.asarray((depth > -0.5).all(axis=1))

@@ -29,6 +29,7 @@ from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
@@ -165,14 +166,14 @@ class MaskWeights:
         """
         masks = _fractions(self.masks(images)) if callable(self.masks) else np.asarray(self.masks)
         (x, y), (height, width) = images.origin, images.shape
-        part = masks if callable(self.masks) else masks[:, y : y + height, x : x + width]
-        if part.shape != images.values.shape:
-            told = f" ({', '.join(self.names)})" if self.names else ""
+        window_masks = masks if callable(self.masks) else masks[:, y : y + height, x : x + width]
+        if window_masks.shape != images.values.shape:
+            file_names = f" ({', '.join(self.names)})" if self.names else ""
             raise InputError(
                 f"there must be one mask per light ({', '.join(images.names)}), of the size of the frame; given are "
-                f"{len(masks)} masks{told} of {_size(masks)} px, the images have {_size(images.values)} px"
+                f"{len(masks)} masks{file_names} of {_size(masks)} px, the images have {_size(images.values)} px"
             )
-        return np.where(images.valid, part, np.float32(0))
+        return np.where(images.valid, window_masks, np.float32(0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
         """The masks where the images are valid.
@@ -205,7 +206,7 @@ def _size(image: FloatImage) -> str:
 
 
 def precision_method(weights: Any, method: str) -> PrecisionMethod | None:
-    """What learns from the residual: the `weights`, or the statistics where `method` is that; None if nothing does.
+    """Return what learns from the residual: the `weights`, the statistics where `method` is that, or None.
 
     Parameters
     ----------
@@ -312,11 +313,12 @@ def prepare_weights(
         return prepare(settings, lights=reference.names, shape=frame, frames=frames)  # type: ignore[no-any-return]
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
-        given = np.asarray(masks.masks)
-        if given.shape != (len(reference.names), *frame):
+        mask_values = np.asarray(masks.masks)
+        if mask_values.shape != (len(reference.names), *frame):
             raise ConfigurationError(
                 f"weights.images must name one mask per light ({', '.join(reference.names)}), of the frames' "
-                f"{frame[1]} x {frame[0]} px; given are {len(given)} ({', '.join(masks.names)}) of {_size(given)} px"
+                f"{frame[1]} x {frame[0]} px; given are {len(mask_values)} ({', '.join(masks.names)}) of "
+                f"{_size(mask_values)} px"
             )
         return masks
     if weights.method != "threshold":
@@ -341,6 +343,7 @@ class ValidPixels:
         return images.valid.astype(np.float32)
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistics(ValidPixels):
     """Every valid pixel counts by what the residual around it shows. A `LightWeights` and a `PrecisionMethod`.
@@ -357,7 +360,7 @@ class Statistics(ValidPixels):
         (benchmarks/constants.py).
     rounding
         Least variance of a residual, over that of the grey levels, where two images are the same: none is 0.
-    own
+    independent_fraction
         Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same.
     window
         In which variances are found.
@@ -366,7 +369,7 @@ class Statistics(ValidPixels):
     freedom: float = 4.0
     least_variance: float = 0.1
     rounding: float = 1e-6
-    own: float = 0.1
+    independent_fraction: float = 0.1
     window: SlidingWindow = WINDOW
 
     def precision(self, residual: Residual) -> Precision:
@@ -397,36 +400,38 @@ class Statistics(ValidPixels):
         if typical <= 0:
             return Precision(factor=np.ones_like(weights), loss_curvature=np.ones_like(weights[0]))
         floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
-        factor = pixels.from_blocks(_best_fractions(covariance, floor, self.own), self.window.step)
-        mean, used, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
-        best_mean(factor, weights, residual.difference, mean, used)
-        variance, least = self.window.covariance(pixels, mean[None], used[None])[0], floor / len(factor)
-        around = pixels.from_blocks(np.maximum(variance, least), self.window.step)[0]
-        displacing = design_effect(residual.reference, mean, used / around)
-        unit = max(np.float32(_typical(variance)), least)
-        robust_weights(mean, around, displacing, unit, np.float32(self.freedom), factor, bend)
+        factor = pixels.from_blocks(_best_fractions(covariance, floor, self.independent_fraction), self.window.step)
+        mean, has_weight, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
+        best_mean(factor, weights, residual.difference, mean, has_weight)
+        variance, min_variance = self.window.covariance(pixels, mean[None], has_weight[None])[0], floor / len(factor)
+        variance_map = pixels.from_blocks(np.maximum(variance, min_variance), self.window.step)[0]
+        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
+        unit = max(np.float32(_typical(variance)), min_variance)
+        robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
         return Precision(factor=factor, loss_curvature=bend)
 
 
 def _typical(variance: FloatImage) -> float:
     """Median of a variance that is known on a grid (..., h, w), 0 where it is not; one in four shows it."""
-    some = variance[..., ::2, ::2]
-    known = some[some > 0]
-    return float(np.median(known)) if known.size else 0.0
+    subsample = variance[..., ::2, ::2]
+    positive = subsample[subsample > 0]
+    return float(np.median(positive)) if positive.size else 0.0
 
 
-def _best_fractions(covariance: FloatImage, least: np.float32, own: float) -> FloatImage:
+def _best_fractions(covariance: FloatImage, min_variance: np.float32, independent_fraction: float) -> FloatImage:
     """Solve ``C x = 1`` for the lights' fractions (k, h, w) of the mean of least variance, up to a factor.
 
-    C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more, of which each light has the
-    fraction `own` for itself.
+    C is the residuals' `covariance` (k, k, h, w), with variances of `min_variance` or more, of which each light has the
+    fraction `independent_fraction` for itself.
     """
     lights = range(len(covariance))
     matrices = covariance.copy()
-    matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
+    matrices[lights, lights] = np.maximum(matrices[lights, lights], min_variance)
     for a, b in combinations(lights, 2):
-        most = (1 - own) * np.sqrt(matrices[a, a] * matrices[b, b])
-        matrices[a, b] = matrices[b, a] = np.clip((1 - own) * matrices[a, b], -most, most)
+        max_covariance = (1 - independent_fraction) * np.sqrt(matrices[a, a] * matrices[b, b])
+        matrices[a, b] = matrices[b, a] = np.clip(
+            (1 - independent_fraction) * matrices[a, b], -max_covariance, max_covariance
+        )
     fractions: FloatImage = np.ones_like(matrices[0])
     # elimination on whole grids: ten times as fast as a LAPACK call for each block
     for a, b in combinations(lights, 2):

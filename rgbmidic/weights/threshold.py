@@ -271,15 +271,15 @@ def set_up_threshold(
     smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     zone = disturbed_zone(high_passed, (float(column), float(row)), element_size)
-    if zone.contrast <= (least := max(CONSTANTS.disturbed, zone.chance)):
+    if zone.contrast <= (min_contrast := max(CONSTANTS.disturbed, zone.chance)):
         raise InputError(
             f"no disturbed zone around {zone.centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
-            f"{zone.unaffected:.2g} px away from it, less than {least:.2g} times as much"
+            f"{zone.unaffected:.2g} px away from it, less than {min_contrast:.2g} times as much"
         )
     # the mean over the part of the zone's perimeter that lies inside the image
     angle = np.linspace(0, 2 * np.pi, max(16, int(2 * np.pi * zone.radius)), endpoint=False)
-    place = [zone.centre[1] + zone.radius * np.sin(angle), zone.centre[0] + zone.radius * np.cos(angle)]
-    level = float(np.nanmean(map_coordinates(image, place, order=1, mode="constant", cval=np.nan)))
+    perimeter = [zone.centre[1] + zone.radius * np.sin(angle), zone.centre[0] + zone.radius * np.cos(angle)]
+    level = float(np.nanmean(map_coordinates(image, perimeter, order=1, mode="constant", cval=np.nan)))
     return SetUpThreshold(zone=zone, contour=level, value=level - CONSTANTS.margin)
 
 
@@ -291,8 +291,8 @@ def _first_crossing(radii: FloatArray, profile: FloatArray, limit: float, peak: 
     if not below.size:
         return float(radii[-1])
     outer = peak + int(below[0])
-    (here, following), (near, far) = profile[outer - 1 : outer + 1], radii[outer - 1 : outer + 1]
-    return float(near + (here - limit) / (here - following) * (far - near))
+    (last_above, first_below), (near, far) = profile[outer - 1 : outer + 1], radii[outer - 1 : outer + 1]
+    return float(near + (last_above - limit) / (last_above - first_below) * (far - near))
 
 
 def automatic_weights(
@@ -307,23 +307,25 @@ def automatic_weights(
 
     Parameters as in `rgbmidic.weights.prepare_weights`.
     """
-    blur, found, why = settings.weights.blur, None, "there is no deformed frame"
+    blur, threshold, reason = settings.weights.blur, None, "there is no deformed frame"
     measured = range(settings.frames.first, frames, settings.frames.step)
     index = next((i for i in measured if i not in settings.frames.reference), None)
     if index is not None:
-        why = f"no disturbed zone in frame {index}"
+        reason = f"no disturbed zone in frame {index}"
         size, prefilter = settings.mesh.side, settings.solver.prefilter
         try:
             deformed = images_of(index)
-            found = automatic_threshold(reference, deformed, region, blur=blur, element_size=size, prefilter=prefilter)
+            threshold = automatic_threshold(
+                reference, deformed, region, blur=blur, element_size=size, prefilter=prefilter
+            )
         except RgbmidicError as error:
-            why = f"frame {index} cannot be used: {error}"
-    value = FALLBACK if found is None else found.value
-    if found is None:
-        logger.warning('weights.threshold = "auto": %s; the threshold is %.3g of the dynamic range', why, value)
+            reason = f"frame {index} cannot be used: {error}"
+    value = FALLBACK if threshold is None else threshold.value
+    if threshold is None:
+        logger.warning('weights.threshold = "auto": %s; the threshold is %.3g of the dynamic range', reason, value)
     else:
-        place = found.zone.radius, found.zone.centre, index
-        logger.info("threshold %.3f: disturbed zone of radius %.0f px around %s in frame %d", value, *place)
+        zone_values = threshold.zone.radius, threshold.zone.centre, index
+        logger.info("threshold %.3f: disturbed zone of radius %.0f px around %s in frame %d", value, *zone_values)
     return ThresholdWeights(threshold=value, blur=blur, notes={"weights_threshold": value})
 
 
@@ -354,28 +356,28 @@ def automatic_threshold(
     prefilter
         Of the correlation; a Bayer mosaic needs ``"binomial"``.
     """
-    mesh, found = Tri3Mesh.from_region(region, element_size), list[SetUpThreshold]()
+    mesh, thresholds = Tri3Mesh.from_region(region, element_size), list[SetUpThreshold]()
     typical = float(np.median(blurred(reference, blur)[:, region.mask], axis=1).max()) / reference.full_scale
     for light, name in enumerate(reference.names):
-        before = Reference.prepare(
+        reference_state = Reference.prepare(
             reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter, brightness="none"
         )
-        after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
-        solution = track(before, after, TrackingState(displacement=None), SolverSettings(), None)
+        deformed_state = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
+        solution = track(reference_state, deformed_state, TrackingState(displacement=None), SolverSettings(), None)
         if solution.status is Status.FAILED:
             logger.info("%s alone, without weights: %s", name, solution.reason)
             continue
         # of u and v the smaller shows a disturbance best
-        for component, shown in zip("uv", at_pixels(mesh, solution.displacement, reference.shape), strict=True):
+        for component, displacement in zip("uv", at_pixels(mesh, solution.displacement, reference.shape), strict=True):
             try:
-                ripple = high_pass(shown)
+                ripple = high_pass(displacement)
                 threshold = set_up_threshold(ripple, reference, light=light, blur=blur, element_size=element_size)
             except InputError as error:
                 logger.info("%s alone, without weights, %s: %s", name, component, error)
                 continue
             values = [value for value in (threshold.value, threshold.contour) if typical < value <= 1]
             if values:
-                found.append(replace(threshold, value=values[0]))
+                thresholds.append(replace(threshold, value=values[0]))
             else:
                 logger.info("%s alone, %s: the disturbed zone is not brighter than the rest", name, component)
-    return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
+    return max(thresholds, key=lambda threshold: threshold.zone.contrast, default=None)

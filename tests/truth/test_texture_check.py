@@ -8,7 +8,7 @@ import pytest
 
 from rgbmidic import correlate
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline.suitability import SUITABILITY, neighbour_correlation
+from rgbmidic.pipeline.frame_quality import SUITABILITY, neighbour_correlation
 
 SIDE = 256
 SHIFT = (0.4, -0.3)

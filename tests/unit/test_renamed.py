@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from results import make_result
 
-from rgbmidic import correlation, frames, mesh, renamed, report, results
+from rgbmidic import correlation, frames, mesh, renamed, report, results, weights
+from rgbmidic import fields as rgbmidic_fields
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab import inspection
 from rgbmidic.results import comparison, simulation
@@ -19,6 +20,8 @@ CLASSES = {
     "IlluminationImages": IlluminationImages,
     **vars(correlation),
     **vars(frames),
+    **vars(rgbmidic_fields),
+    **vars(weights),
     **vars(mesh),
     **vars(inspection),
     **vars(comparison),

@@ -32,8 +32,8 @@ from rgbmidic.lab.inspection.lamps import LampBalance
 from rgbmidic.lab.inspection.prediction import Prediction, predict, separate_with_errors
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.frame_quality import clipping, repetition, separation_doubts
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
-from rgbmidic.pipeline.suitability import clipping, repetition, separation_doubts
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, ProgressCallback
 

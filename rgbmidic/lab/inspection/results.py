@@ -15,7 +15,7 @@ from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.suitability import SPECKLES, SUITABILITY
+from rgbmidic.pipeline.frame_quality import SPECKLES, SUITABILITY
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -153,7 +153,7 @@ class Inspection:
     repetition : str
         How the texture repeats itself; empty: it does not.
     doubts : tuple of Check
-        Lights that lie apart or show no common texture (`rgbmidic.pipeline.suitability.separation_doubts`), lamps of
+        Lights that lie apart or show no common texture (`rgbmidic.pipeline.frame_quality.separation_doubts`), lamps of
         unequal strength.
 
     Examples

@@ -7,7 +7,7 @@ import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation
 
 from rgbmidic.correlation.recovery import at_free_boundary, quadratic_fit
-from rgbmidic.fields import Nodal, Places, ProfileLine, StrainGauges, at_pixels, make_probe
+from rgbmidic.fields import MeshPoints, Nodal, ProfileLine, StrainGauges, at_pixels, make_probe
 from rgbmidic.fields.interpolation import PointSum
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import FloatArray
@@ -28,7 +28,7 @@ def quadratic(points: FloatArray) -> FloatArray:
 def naive(mesh: Tri3Mesh, values: FloatArray, point: FloatArray, has_data: np.ndarray) -> float:
     """The definition, corner by corner and node by node."""
     fits = [one.toarray() for one in quadratic_fit(mesh, has_data[mesh.elements].all(axis=1))]
-    places, total = Places.of(mesh, point), 0.0
+    places, total = MeshPoints.of(mesh, point), 0.0
     edge = at_free_boundary(mesh, has_data[mesh.elements].all(axis=1))
     for node, shape in zip(mesh.elements[places.element[0]], places.barycentric[0], strict=True):
         slope, areas = np.zeros(2), 0.0
@@ -52,14 +52,14 @@ def test_a_quadratic_field_is_read_exactly_at_every_point_of_any_mesh(kind: str)
     mesh = MESHES[kind]
     points = np.concatenate([mesh.centres, mesh.nodes[mesh.neighbours].mean(axis=1), mesh.nodes])
     exact = quadratic(np.concatenate([mesh.nodes, points]))
-    read = Places.of(mesh, points).read(exact[: len(mesh.nodes)])
+    read = MeshPoints.of(mesh, points).read(exact[: len(mesh.nodes)])
     np.testing.assert_allclose(read, exact[len(mesh.nodes) :], atol=2e-5)
 
 
 def test_it_is_the_definition_also_beside_missing_nodes() -> None:
     values, has_data = RANDOM.normal(size=len(MESH.nodes)), RANDOM.random(len(MESH.nodes)) > 0.1
     values[~has_data] = np.nan
-    read, places = Places.of(MESH, POINTS).read(values), Places.of(MESH, POINTS)
+    read, places = MeshPoints.of(MESH, POINTS).read(values), MeshPoints.of(MESH, POINTS)
     np.testing.assert_array_equal(np.isfinite(read), has_data[MESH.elements[places.element]].all(axis=1))
     assert 10 < np.isfinite(read).sum() < len(read)
     for point, one in zip(POINTS[np.isfinite(read)][:8], read[np.isfinite(read)], strict=False):
@@ -71,7 +71,7 @@ def test_it_is_continuous_across_edges() -> None:
     ends = MESH.nodes[MESH.neighbours]
     across = (ends[:, 1] - ends[:, 0])[:, ::-1] * [1, -1] * 1e-7
     middle = 0.3 * ends[:, 0] + 0.7 * ends[:, 1]
-    sides = [Places.of(MESH, middle + turn * across).read(values) for turn in (1, -1)]
+    sides = [MeshPoints.of(MESH, middle + turn * across).read(values) for turn in (1, -1)]
     both = np.isfinite(sides[0] + sides[1]).all(axis=1)
     np.testing.assert_allclose(sides[0][both], sides[1][both], atol=1e-5)
     assert both.mean() > 0.7
@@ -79,7 +79,7 @@ def test_it_is_continuous_across_edges() -> None:
 
 def test_point_pixel_profile_sum_and_weights_are_one_field() -> None:
     values = RANDOM.normal(size=(len(MESH.nodes), 2))
-    places = Places.of(MESH, np.round(POINTS))
+    places = MeshPoints.of(MESH, np.round(POINTS))
     read = places.read(values)
     np.testing.assert_allclose(places.weights(ALL) @ values, read, atol=1e-12)
     pixels = at_pixels(MESH, values, (200, 240))
@@ -87,7 +87,7 @@ def test_point_pixel_profile_sum_and_weights_are_one_field() -> None:
     np.testing.assert_allclose(pixels[:, rows, columns].T, read, atol=1e-5)
     line = ProfileLine(COVARIANCE, StrainGauges.at_nodes(COVARIANCE), 33, 40, 190, 120)
     along, spread = line.read(values[:, 0], np.full(len(values), 0.01))
-    np.testing.assert_allclose(along, Places.of(MESH, line.points).read(values[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(along, MeshPoints.of(MESH, line.points).read(values[:, 0]), atol=1e-12)
     probe = make_probe(COVARIANCE, "point", 1, line.points[5])
     u, v = values[None, probe.nodes].transpose(2, 0, 1)
     point = probe.histories(Nodal(u=u, v=v, u_std=np.full(u.shape, 0.01), v_std=np.full(u.shape, 0.01)))[0]
@@ -98,13 +98,15 @@ def test_point_pixel_profile_sum_and_weights_are_one_field() -> None:
 
 def test_the_sum_over_points_has_the_slopes_of_the_field() -> None:
     values, area = RANDOM.normal(size=len(MESH.nodes)), RANDOM.uniform((40, 40), (150, 120), (300, 2))
-    total = PointSum.over(Places.of(MESH, area), np.full(300, 1 / 300), slopes=True)
+    total = PointSum.over(MeshPoints.of(MESH, area), np.full(300, 1 / 300), slopes=True)
     weights, measured = total.weights(np.ones(len(total.nodes), dtype=bool))
     step = 1e-4
-    read = [Places.of(MESH, area + shift).read(values) for shift in step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])]
+    read = [
+        MeshPoints.of(MESH, area + shift).read(values) for shift in step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    ]
     slopes = (read[0] - read[1]).mean() / (2 * step), (read[2] - read[3]).mean() / (2 * step)
     assert measured == pytest.approx(1)
-    expected = [Places.of(MESH, area).read(values).mean(), *slopes]
+    expected = [MeshPoints.of(MESH, area).read(values).mean(), *slopes]
     np.testing.assert_allclose(weights @ values[total.nodes], expected, atol=1e-5)
 
 
@@ -113,21 +115,21 @@ def test_a_point_on_a_node_or_an_edge_needs_no_other_node() -> None:
     has_data = ALL.copy()
     has_data[MESH.elements[(MESH.elements == i).any(axis=1)]] = False
     has_data[[i, j]] = True
-    places = Places.of(
+    places = MeshPoints.of(
         MESH, np.stack([MESH.nodes[i], MESH.nodes[[i, j]].mean(axis=0), MESH.nodes[[i, j]].mean(axis=0) + 1])
     )
     assert places.measured(has_data).tolist() == [True, True, False]
 
 
 def test_between_nodes_the_stated_uncertainty_is_that_of_noise() -> None:
-    weights = Places.of(MESH, POINTS).weights(ALL).toarray()
+    weights = MeshPoints.of(MESH, POINTS).weights(ALL).toarray()
     stated = np.sqrt(COVARIANCE.variance(weights, np.full(len(MESH.nodes), 1.0)))
     np.testing.assert_allclose(stated, np.sqrt(np.diag(weights @ dense_correlation(MESH) @ weights.T)), rtol=0.02)
     assert 0.5 < stated.min() < stated.max() < 1.1
 
 
 def test_parts_of_the_elements_cover_them() -> None:
-    places, parts = Places.parts(ROUND, 4)
+    places, parts = MeshPoints.subdivide(ROUND, 4)
     fine = Tri3Mesh(nodes=places.points, elements=parts)
     assert places.inside.all()
     assert len(parts) == 16 * len(ROUND.elements)

@@ -65,7 +65,7 @@ def test_a_mean_in_glare_is_less_certain() -> None:
     part = exact[np.ix_(probe.nodes, probe.nodes)]
     mean, *_ = probe.histories(Nodal.of(FIELDS[:, :1, probe.nodes]))
     plain, *_ = probe.histories(Nodal.of(FIELDS[:4, :1, probe.nodes]))
-    covariance = COVARIANCE.part(probe.nodes)
+    covariance = COVARIANCE.subset(probe.nodes)
     factor = covariance.factor(STD[probe.nodes], BIAS[probe.nodes])
     np.testing.assert_allclose((factor @ factor.T).toarray(), part, atol=1e-2 * BIAS.max() ** 2)
     assert np.all(np.asarray(mean.std) > 1.5 * np.asarray(plain.std))

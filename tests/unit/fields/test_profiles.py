@@ -73,8 +73,8 @@ def test_the_speed_of_a_pulse_lies_within_its_uncertainty(field: str, what: str)
     kind, errors, stds = "" if field == "u" else "exx", [], []
     for seed in range(100, 120):
         values, std = along(field, 0.03, seed)
-        arrivals = arrival_times(np.arange(FRAMES), values, std, what=what)
-        front = fit_front(LINE.positions, arrivals, std, LINE.correlation(kind), usable=LINE.even)
+        arrivals = arrival_times(np.arange(FRAMES), values, std, feature=what)
+        front = fit_front(LINE.positions, arrivals, std, LINE.correlation(kind), usable=LINE.is_two_sided)
         errors.append(front.speed - TRUE)
         stds.append(front.speed_std)
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stds)))
@@ -146,7 +146,7 @@ def test_arrival_times_state_their_noise_and_skip_missing_frames() -> None:
     values = pulse + random.normal(0, 0.03, std.shape)
     values[15, :200] = np.nan
     for what in ("front", "peak"):
-        found = arrival_times(times, values, std, what=what, common_fraction=0.0)
+        found = arrival_times(times, values, std, feature=what, common_fraction=0.0)
         assert 0.85 < found.times.std() / np.median(found.std) < 1.15
         if what == "peak":
             assert found.times.mean() == pytest.approx(30.3, abs=0.1)

@@ -16,7 +16,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.images import local_mean
-from rgbmidic.pipeline.suitability import check_texture, exposure_fault, neighbour_correlation
+from rgbmidic.pipeline.frame_quality import check_texture, exposure_fault, neighbour_correlation
 
 INSIDE = np.zeros(SHAPE, dtype=bool)
 INSIDE[16:129, 16:129] = True

@@ -96,10 +96,10 @@ def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Dying(engine.Threads):
-        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.Measured]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.FrameOutcome]:
             if index != 5:
                 return super().submit(index, start, updated)
-            dead: Future[frame.Measured] = Future()
+            dead: Future[frame.FrameOutcome] = Future()
             dead.set_exception(RuntimeError("the cluster gave up"))  # as distributed's KilledWorker
             return dead
 
@@ -119,10 +119,10 @@ def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: 
         return measured
 
     plan = Plan.from_settings(settings(movie))
-    measured = frame.attempt(plan, 0, TrackingState(displacement=None))
+    measured = frame.measure_frame_safely(plan, 0, TrackingState(displacement=None))
     before = threads()
     set_threads(4)
-    monkeypatch.setattr(engine, "attempt", watched)
+    monkeypatch.setattr(engine, "measure_frame_safely", watched)
     try:
         with closing(engine.Threads(plan, 2)) as pool:
             running = [pool.submit(index, TrackingState(displacement=None)) for index in range(2)]
@@ -158,7 +158,7 @@ def test_the_frames_of_chains_are_measured_in_step(
     order = list[int]()
 
     class Watching(engine.Threads):
-        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.Measured]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.FrameOutcome]:
             order.append(index)
             return super().submit(index, start, updated)
 
@@ -359,11 +359,11 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
-        failed = frame.Measured(record=frame.failed_frame(plan, index, "out of memory"))
-        return failed if index == 33 else frame.attempt(plan, index, start, updated)
+        failed = frame.FrameOutcome(record=frame.failed_frame(plan, index, "out of memory"))
+        return failed if index == 33 else frame.measure_frame_safely(plan, index, start, updated)
 
     with monkeypatch.context() as patched:
-        patched.setattr("rgbmidic.pipeline.engine.attempt", failing)
+        patched.setattr("rgbmidic.pipeline.engine.measure_frame_safely", failing)
         measure(settings(movie), tmp_path / "result")
     measured: list[str] = []
     result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
@@ -424,10 +424,10 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
     def watched(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
-        lost = frame.Measured(record=frame.failed_frame(plan, index, "lost"))
-        return lost if index == 16 and len(starts) == 17 else frame.attempt(plan, index, start, updated)
+        lost = frame.FrameOutcome(record=frame.failed_frame(plan, index, "lost"))
+        return lost if index == 16 and len(starts) == 17 else frame.measure_frame_safely(plan, index, start, updated)
 
-    monkeypatch.setattr("rgbmidic.pipeline.engine.attempt", watched)
+    monkeypatch.setattr("rgbmidic.pipeline.engine.measure_frame_safely", watched)
     result = in_order(settings(movie, last=18), tmp_path / "result")
     tries = [moved for index, moved in starts if index == 16]
     assert tries == pytest.approx([0.0, 1.5], abs=0.1)

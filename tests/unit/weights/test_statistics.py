@@ -79,10 +79,10 @@ def test_the_best_fractions_are_the_inverse_covariance_times_one(lights):
     covariance = residuals @ residuals.swapaxes(2, 3)
     bounded = covariance.copy()
     own = np.broadcast_to(np.eye(lights, dtype=bool), covariance.shape)
-    bounded[~own] *= 1 - Statistics().own
+    bounded[~own] *= 1 - Statistics().independent_fraction
     wanted = np.linalg.solve(bounded, np.ones((lights, 1)))[..., 0]
     found = _best_fractions(
-        np.moveaxis(covariance, (2, 3), (0, 1)).astype(np.float32), np.float32(1e-3), Statistics().own
+        np.moveaxis(covariance, (2, 3), (0, 1)).astype(np.float32), np.float32(1e-3), Statistics().independent_fraction
     )
     np.testing.assert_allclose(np.moveaxis(found, 0, 2), wanted, rtol=1e-3, atol=1e-6)
 

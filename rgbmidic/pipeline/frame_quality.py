@@ -34,7 +34,7 @@ SPECKLES = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuitabilityConstants:
-    """From where on a state cannot be measured, or hardly.
+    """Limits beyond which a state cannot be measured, or hardly.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class SuitabilityConstants:
     repeated
         Correlation of the texture with itself, displaced by more than a speckle, from which it repeats itself. Of 360
         random speckles of 2 to 10 px in regions of 70 to 300 px none exceeds .35; dots on a grid reach 1, with a jitter
-        of a tenth of their pitch .7 (tests/unit/pipeline/test_suitability.py).
+        of a tenth of their pitch .7 (tests/unit/pipeline/test_frame_quality.py).
     enough_speckles
         Number of speckles in the overlap of the texture with itself from which their correlation counts: it then
         scatters by .1.
@@ -94,28 +94,30 @@ SUITABILITY = SuitabilityConstants()
 
 def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]:
     """Median grey level of each light in the region, as a fraction of the full scale; 0 where nothing is usable."""
-    known = (light[np.isfinite(light)] for light in images.values[:, region.mask])
+    finite_samples = (light[np.isfinite(light)] for light in images.values[:, region.mask])
     usable = images.full_scale > 0
-    medians = (float(np.median(light)) / images.full_scale if light.size and usable else 0.0 for light in known)
+    medians = (
+        float(np.median(light)) / images.full_scale if light.size and usable else 0.0 for light in finite_samples
+    )
     return dict(zip(images.names, medians, strict=True))
 
 
-def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
+def warn_small_elements(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
     """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
 
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.nodal_variance_factor`).
     """
     sides = np.sqrt(2 * mesh.areas)
-    few = SPECKLES * (speckle or 0.0)
-    if not (small := sides < few).any():
+    min_side = SPECKLES * (speckle or 0.0)
+    if not (small := sides < min_side).any():
         return
-    least = int(np.argmin(sides))
+    smallest = int(np.argmin(sides))
     typical = float(np.median(sides[small]))
     text = (
         f"{int(small.sum())} of {sides.size} triangles have sides under {SPECKLES:g} speckles of {speckle:.1f} px, "
-        f"{typical:.1f} px in the median (element {finite_elements.element_numbers[least]}: {sides[least]:.1f} px): "
-        f"expect {few / typical:.1f} times ({few / sides[least]:.1f} times) the uncertainty of elements of "
-        f"{SPECKLES:g} speckles; with fewer than {SUITABILITY.enough:g} nodes are lost"
+        f"{typical:.1f} px in the median (element {finite_elements.element_numbers[smallest]}: {sides[smallest]:.1f} "
+        f"px): expect {min_side / typical:.1f} times ({min_side / sides[smallest]:.1f} times) the uncertainty of "
+        f"elements of {SPECKLES:g} speckles; with fewer than {SUITABILITY.enough:g} nodes are lost"
     )
     logger.warning("%s: %s", finite_elements.name, text)
 
@@ -130,17 +132,17 @@ def _middle(inside: BoolArray, side: int = 256) -> tuple[slice, slice]:
     return ends[0], ends[1]
 
 
-def _lit_pictures(images: IlluminationImages, region: Region) -> list[FloatArray]:
+def _images_of_lit_lights(images: IlluminationImages, region: Region) -> list[FloatArray]:
     """Images of the lights that are on, in the middle of the region; the mean where a pixel is not valid."""
     levels = light_levels(images, region).values()
-    lit = [level >= DARK for level in levels] if max(levels) >= DARK else [True] * len(images.names)
-    pictures = images.values[lit][:, *_middle(region.mask)].astype(np.float64)
-    return [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
+    is_on = [level >= DARK for level in levels] if max(levels) >= DARK else [True] * len(images.names)
+    pictures = images.values[is_on][:, *_middle(region.mask)].astype(np.float64)
+    return [np.where(np.isfinite(image), image, np.nanmean(image)) for image in pictures if np.isfinite(image).any()]
 
 
 def speckle_size(images: IlluminationImages, region: Region) -> float | None:
     """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
-    sizes = [size for one in _lit_pictures(images, region) if (size := speckle_diameter(one)) is not None]
+    sizes = [size for image in _images_of_lit_lights(images, region) if (size := speckle_diameter(image)) is not None]
     return float(np.median(sizes)) if sizes else None
 
 
@@ -161,12 +163,12 @@ def repetition(images: IlluminationImages, region: Region, speckle: float | None
     str or None
         The distance and how well it agrees with itself there, in words; None: it does not repeat itself.
     """
-    if speckle is None or not (pictures := _lit_pictures(images, region)):
+    if speckle is None or not (pictures := _images_of_lit_lights(images, region)):
         return None
     size = [next_fast_len(2 * side, real=True) for side in pictures[0].shape]
     power = np.zeros((size[0], size[1] // 2 + 1))
-    for one in pictures:
-        texture = one - local_mean(one.astype(np.float32), 4 * speckle)
+    for picture in pictures:
+        texture = picture - local_mean(picture.astype(np.float32), 4 * speckle)
         power += np.abs(rfft2(texture / max(float(texture.std()), 1e-6), s=size)) ** 2 / len(pictures)
     reach = [side // 2 for side in pictures[0].shape]
     lags = np.ix_(*(np.arange(-far, far + 1) for far in reach))
@@ -177,12 +179,12 @@ def repetition(images: IlluminationImages, region: Region, speckle: float | None
     unit = max(float(correlation[reach[0] + 1, reach[1]]), float(correlation[reach[0], reach[1] + 1]), 1e-6)
     peaks, count = label(correlation > SUITABILITY.repeated * unit)
     best = maximum(correlation, peaks, range(1, count + 1)) if count else []
-    others = [number for number in range(1, count + 1) if number != peaks[reach[0], reach[1]]]
-    clear = [number for number in others if best[number - 1] > 0.9 * max(best[other - 1] for other in others)]
+    other_peaks = [number for number in range(1, count + 1) if number != peaks[reach[0], reach[1]]]
+    clear = [number for number in other_peaks if best[number - 1] > 0.9 * max(best[peak - 1] for peak in other_peaks)]
     if not clear:
         return None
-    places = [np.subtract(maximum_position(correlation, peaks, number), reach) for number in clear]
-    row, column = min(places, key=lambda place: float(np.hypot(*place)))
+    displacements = [np.subtract(maximum_position(correlation, peaks, number), reach) for number in clear]
+    row, column = min(displacements, key=lambda displacement: float(np.hypot(*displacement)))
     agreement = min(float(correlation[reach[0] + row, reach[1] + column]) / unit, 1.0)
     return (
         f"the texture repeats itself: displaced by ({abs(column)}, {abs(row)}) px it agrees with itself to "
@@ -207,7 +209,7 @@ def separation_doubts(images: IlluminationImages, region: Region) -> list[Check]
         None for lights that were not separated by the reflection-aware method.
     """
     doubts = []
-    if images.displacement is not None and (text := _lights_apart(images, images.displacement, region)):
+    if images.displacement is not None and (text := _describe_misregistration(images, images.displacement, region)):
         doubts.append(Check("lights apart", text))
     if images.texture is not None and not images.texture.common:
         doubts.append(
@@ -222,7 +224,7 @@ def separation_doubts(images: IlluminationImages, region: Region) -> list[Check]
     return doubts
 
 
-def _lights_apart(images: IlluminationImages, displacement: LightDisplacement, region: Region) -> str:
+def _describe_misregistration(images: IlluminationImages, displacement: LightDisplacement, region: Region) -> str:
     """Which lights show the texture apart from the first one, how far, and what to do; else nothing."""
     shape = displacement.std.shape[1:]
     cells = np.zeros((shape[0] * BLOCK, shape[1] * BLOCK), dtype=np.float32)
@@ -230,22 +232,22 @@ def _lights_apart(images: IlluminationImages, displacement: LightDisplacement, r
     inside = cells.reshape(shape[0], BLOCK, shape[1], BLOCK).mean(axis=(1, 3)) > 0.5
     if not inside.any():
         return ""
-    away = np.sqrt((displacement.lateral(inside) ** 2).sum(axis=2))
+    distance = np.sqrt((displacement.lateral(inside) ** 2).sum(axis=2))
     registered = images.registration is not None
-    least = SUITABILITY.lateral if registered else SUITABILITY.unregistered
-    rms = np.sqrt((away**2).mean(axis=1))
+    min_distance = SUITABILITY.lateral if registered else SUITABILITY.unregistered
+    rms = np.sqrt((distance**2).mean(axis=1))
     lights = [
-        f"{name} lies {mean:.2f} px (up to {most:.2f} px)"
-        for name, mean, most in zip(images.names, rms, away.max(axis=1), strict=True)
-        if mean > least
+        f"{name} lies {mean:.2f} px (up to {largest:.2f} px)"
+        for name, mean, largest in zip(images.names, rms, distance.max(axis=1), strict=True)
+        if mean > min_distance
     ]
     if not lights:
         return ""
-    where = f"{' and '.join(lights)} from {images.names[0]}"
+    text = f"{' and '.join(lights)} from {images.names[0]}"
     if registered:
-        return f"beyond the calibrated registration {where}: it is not of this set-up; rgbmidic-calibrate registration"
+        return f"beyond the calibrated registration {text}: it is not of this set-up; rgbmidic-calibrate registration"
     return (
-        f"no registration is calibrated, but {where}: at half a pixel errors are 1.2 to 1.8 times as large, most under "
+        f"no registration is calibrated, but {text}: at half a pixel errors are 1.2 to 1.8 times as large, most under "
         "strain; rgbmidic-calibrate registration"
     )
 
@@ -259,10 +261,13 @@ def background_fraction(
     """
     rows, columns = (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
     step = int(np.ceil(np.sqrt(len(rows) * len(columns) / 2e6)))
-    part = slice(rows[0], rows[-1] + 1, step), slice(columns[0], columns[-1] + 1, step)
-    inside, box = region.mask[*part], replace(images, values=images.values[:, *part], valid=images.valid[:, *part])
-    shown = LocalContrast.of(box, [] if speckle is None else [speckle / step], inside, noise)
-    return float(shown.background(inside)[inside].mean())
+    window = slice(rows[0], rows[-1] + 1, step), slice(columns[0], columns[-1] + 1, step)
+    inside, box = (
+        region.mask[*window],
+        replace(images, values=images.values[:, *window], valid=images.valid[:, *window]),
+    )
+    contrast = LocalContrast.of(box, [] if speckle is None else [speckle / step], inside, noise)
+    return float(contrast.background(inside)[inside].mean())
 
 
 class ReferenceMotion:
@@ -276,7 +281,7 @@ class ReferenceMotion:
 
     def __init__(self, inside: BoolArray) -> None:
         """Take the region (H, W)."""
-        self.largest, self._part = 0.0, _middle(inside)
+        self.largest, self._window = 0.0, _middle(inside)
         self._first: FloatArray | None = None
 
     def watch(self, states: Iterable[RawState]) -> Iterator[RawState]:
@@ -292,7 +297,7 @@ class ReferenceMotion:
     def _picture(self, state: RawState) -> tuple[FloatArray, int]:
         """Picture of a state, and the side of its pixels; the colours of a mosaic's cell are added."""
         frame = state if isinstance(state, IlluminationImages) else state[0]
-        values = frame.values[..., *self._part].astype(np.float64)
+        values = frame.values[..., *self._window].astype(np.float64)
         if isinstance(frame, Mosaic):
             rows, columns = (side // 2 * 2 for side in values.shape)
             return values[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)), 2
@@ -300,7 +305,7 @@ class ReferenceMotion:
 
 
 def unsteady(motion: float) -> str:
-    """What reference frames that move by so many px against each other mean."""
+    """State what reference frames that move by so many px against each other mean."""
     return (
         f"the reference frames move against each other by up to {motion:.2g} px: their mean is blurred, and counts as "
         "being at rest; state frames at rest as frames.reference, or one"
@@ -310,18 +315,18 @@ def unsteady(motion: float) -> str:
 def _shift(first: FloatArray, second: FloatArray) -> float:
     """Length of the shift between two pictures in their pixels: of the best correlation, below a pixel by gradients."""
     # of Gaussians of 2 px the differences are gradients, and little of them is noise
-    before, after = (
-        cv2.GaussianBlur(one, (0, 0), 2.0) - cv2.GaussianBlur(one, (0, 0), 20.0) for one in (first, second)
+    first_filtered, second_filtered = (
+        cv2.GaussianBlur(picture, (0, 0), 2.0) - cv2.GaussianBlur(picture, (0, 0), 20.0) for picture in (first, second)
     )
     size = [next_fast_len(2 * side, real=True) for side in first.shape]
-    correlation = irfft2(rfft2(after, s=size) * np.conj(rfft2(before, s=size)), s=size)
+    correlation = irfft2(rfft2(second_filtered, s=size) * np.conj(rfft2(first_filtered, s=size)), s=size)
     best = np.unravel_index(int(correlation.argmax()), correlation.shape)
-    whole = np.linalg.norm([(int(at) + side // 2) % side - side // 2 for at, side in zip(best, size, strict=True)])
-    if whole > 1.5:
-        return float(whole)
-    along_y, along_x = np.gradient((before + after) / 2)
-    system = np.stack([part.ravel() for part in (along_x, along_y, after, np.ones_like(after))])
-    return float(np.hypot(*(np.linalg.pinv(system @ system.T) @ (system @ before.ravel()))[:2]))
+    distance = np.linalg.norm([(int(at) + side // 2) % side - side // 2 for at, side in zip(best, size, strict=True)])
+    if distance > 1.5:
+        return float(distance)
+    along_y, along_x = np.gradient((first_filtered + second_filtered) / 2)
+    system = np.stack([term.ravel() for term in (along_x, along_y, second_filtered, np.ones_like(second_filtered))])
+    return float(np.hypot(*(np.linalg.pinv(system @ system.T) @ (system @ first_filtered.ravel()))[:2]))
 
 
 def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
@@ -342,14 +347,15 @@ def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
         No frame shows anything in the region that noise would not.
     """
     frames = [state] if isinstance(state, IlluminationImages) else state
-    shown = [neighbour_correlation(frame, inside) for frame in frames]
-    told = f"neighbouring samples of the reference ({name}) correlate by {min(shown):.2f} in the region"
-    if max(shown) < SUITABILITY.no_texture:
+    correlations = [neighbour_correlation(frame, inside) for frame in frames]
+    message = f"neighbouring samples of the reference ({name}) correlate by {min(correlations):.2f} in the region"
+    if max(correlations) < SUITABILITY.no_texture:
         raise FrameError(
-            f"{told}, where noise gives 0 and speckle .4 or more: there is no texture above the noise to measure with"
+            f"{message}, where noise gives 0 and speckle .4 or more: there is no texture above the noise to measure "
+            "with"
         )
-    if min(shown) < SUITABILITY.faint_texture:
-        logger.warning("%s, where speckle gives .4 or more: its contrast is hardly above the noise", told)
+    if min(correlations) < SUITABILITY.faint_texture:
+        logger.warning("%s, where speckle gives .4 or more: its contrast is hardly above the noise", message)
 
 
 def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> float:
@@ -363,32 +369,32 @@ def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, ins
     planes = _planes(frame, inside)
     rounding = float(np.finfo(np.float32).tiny) if isinstance(frame, IlluminationImages) else QUANTISATION
     energy = [max(float((plane**2).sum()), rounding * plane.size) for plane in planes]
-    own = sum(float((p[:, 1:] * p[:, :-1]).sum() + (p[1:] * p[:-1]).sum()) / 2 for p in planes) / sum(energy)
+    within_channel = sum(float((p[:, 1:] * p[:, :-1]).sum() + (p[1:] * p[:-1]).sum()) / 2 for p in planes) / sum(energy)
     pairs = list(combinations(range(len(planes)), 2))
     total = sum(float(np.sqrt(energy[a] * energy[b])) for a, b in pairs)
-    return max(own, sum(float((planes[a] * planes[b]).sum()) for a, b in pairs) / total if pairs else 0.0)
+    return max(within_channel, sum(float((planes[a] * planes[b]).sum()) for a, b in pairs) / total if pairs else 0.0)
 
 
 def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> list[FloatArray]:
     """Samples of each channel on their own lattice, less their local mean (shading); 0 outside and where saturated."""
     step = 2 if isinstance(frame, Mosaic) else 1
     usable = inside & (frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level)
-    known = np.where(usable, frame.values, np.nan).astype(np.float32).reshape(-1, *inside.shape)
+    samples = np.where(usable, frame.values, np.nan).astype(np.float32).reshape(-1, *inside.shape)
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     # a cell of a mosaic is any 2 x 2 samples, wherever the region begins
     height, width = (int(index[-1] + 1 - index[0]) // step * step for index in (rows, columns))
-    window = known[:, rows[0] : rows[0] + height, columns[0] : columns[0] + width]
+    window = samples[:, rows[0] : rows[0] + height, columns[0] : columns[0] + width]
     planes = [channel[p::step, q::step] for channel in window for p in range(step) for q in range(step)]
     return [np.nan_to_num(plane - local_mean(plane, 5.0)).astype(np.float64) for plane in planes]
 
 
 def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
-    """What is wrong with the exposure or the stated levels of raw frames in a region (H, W); None: nothing evident."""
+    """State what is wrong with the exposure or levels of raw frames in a region (H, W); None: nothing evident."""
     if isinstance(state, IlluminationImages):  # no samples of a camera
         return None
     faults = [_fault(frame, inside) for frame in state]
-    told = [f"light {i + 1}: {fault}" if len(state) > 1 else fault for i, fault in enumerate(faults) if fault]
-    return "; ".join(told) or None
+    texts = [f"light {i + 1}: {fault}" if len(state) > 1 else fault for i, fault in enumerate(faults) if fault]
+    return "; ".join(texts) or None
 
 
 def saturated_fraction(state: RawState, inside: BoolArray) -> float:
@@ -414,7 +420,7 @@ def clipping(state: RawState) -> tuple[float, str] | None:
 
 
 def shifted_levels(samples: AnyArray, white: float) -> str | None:
-    """What is wrong with samples of which the lowest bits are all 0, and the `white` level not that of the others."""
+    """State what is wrong with samples whose lowest bits are all 0, and the `white` level not that of the others."""
     bits, largest = int(np.bitwise_or.reduce(samples, axis=None)), int(samples.max())
     step = bits & -bits  # all samples are multiples of it
     if not (step > 2 and largest > white and white * step <= 65536):
@@ -442,12 +448,12 @@ def _fault(frame: Mosaic | ChannelFrame, inside: BoolArray) -> str | None:
     return None
 
 
-def too_small(element_size: float, speckle: float | None, least: float = SUITABILITY.enough) -> str:
-    """What is wrong with elements (px) that have fewer than `least` speckles (px) on a side, in words; else nothing."""
-    if speckle is None or element_size >= least * speckle:
+def too_small(element_size: float, speckle: float | None, min_speckles: float = SUITABILITY.enough) -> str:
+    """State what is wrong with elements (px) of fewer than `min_speckles` speckles (px) on a side; else nothing."""
+    if speckle is None or element_size >= min_speckles * speckle:
         return ""
     return (
-        f"elements of {element_size:g} px are too small for speckles of {speckle:.1f} px: with fewer than {least:g} "
-        "speckles on a side nodes are lost and frames may not converge; set mesh.element_size to "
+        f"elements of {element_size:g} px are too small for speckles of {speckle:.1f} px: with fewer than "
+        f"{min_speckles:g} speckles on a side nodes are lost and frames may not converge; set mesh.element_size to "
         f"{np.ceil(SUITABILITY.enough * speckle):.0f} or more"
     )

@@ -18,8 +18,7 @@ from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
-from rgbmidic.pipeline.source import SourceSeries
-from rgbmidic.pipeline.suitability import (
+from rgbmidic.pipeline.frame_quality import (
     ReferenceMotion,
     background_fraction,
     clipping,
@@ -27,6 +26,7 @@ from rgbmidic.pipeline.suitability import (
     separation_doubts,
     speckle_size,
 )
+from rgbmidic.pipeline.source import SourceSeries
 from rgbmidic.settings import TestSettings
 
 SHAPE = (120, 140)
@@ -180,7 +180,7 @@ def test_motion_of_more_than_a_pixel_during_the_exposure_is_told(exposed_us, sai
     stated = TestSettings.from_mapping(
         {"frames": {"path": [], "kind": "monochrome", "white_level": 4095}, "region": {"rectangle": [20, 20, 109, 99]}}
     )
-    source = Exposed(source=frames, stated=stated.frames, selected=range(3), shape=SHAPE)
+    source = Exposed(source=frames, user_metadata=stated.frames, selected=range(3), shape=SHAPE)
     measure(stated, tmp_path / "out", source=source)
     assert len(told()) == said
     assert all(
