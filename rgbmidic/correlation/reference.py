@@ -523,12 +523,7 @@ def _where_they_lie(
     x, y = pixels.columns, pixels.rows
     values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
     gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
-    one, zero, unused, moments = (
-        np.ones_like(inside),
-        np.zeros_like(inside),
-        np.empty_like(inside),
-        np.empty((len(mesh.elements), 6)),
-    )
+    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         there, spline = carried(mesh, pixels, motion), state.coefficients[light]
         differences(spline, zero, *there, values[light])
