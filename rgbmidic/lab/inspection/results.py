@@ -167,7 +167,7 @@ class Inspection:
     >>> frame = ChannelFrame(values=levels, black_level=np.zeros(1), white_level=4095.0)
     >>> inspection = inspect_frame(frame, element_size=20)
     >>> [finding.name for finding in inspection.findings]
-    ['noise unknown']
+    ['noise unknown', 'coarse speckle']
     >>> 5 < inspection.speckle_px < 7
     True
     """
