@@ -30,7 +30,7 @@ from .tables import Row, table
 SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 VARIED = {
     "solver": (
-        *("smoothness", "longest_step", "patience", "anchor", "even", "score_range", "prior", "gain_smoothness"),
+        *("smoothness", "longest_step", "patience", "anchor", "even", "score_range", "prior", "window_of_gain"),
         *("worse", "one_sided", "noisy", "begun", "wandering", "swinging", "settled"),
     ),
     "window": ("sigma",),
@@ -106,9 +106,8 @@ def scenes(method: Method) -> dict[str, Solution]:
     return {
         "hole": method.solve(noisy[0], noisy[1], element_size=14),
         "apart": method.solve(noisy[0], noisy[2], element_size=14),
-        "shadow": method.solve(noisy[0], noisy[3], element_size=14, brightness="local"),
-        "shadow, mean": method.solve(noisy[0], noisy[3], element_size=14, brightness="mean"),
-        "lights": method.solve(first, second, brightness="local"),
+        "shadow": method.solve(noisy[0], noisy[3], element_size=14),
+        "lights": method.solve(first, second),
         "gap": method.solve(first, second, weights=weights, element_size=15, rigid="translation"),
         "one": method.solve(first[0], second[0], element_size=12),
     }
