@@ -173,7 +173,7 @@ SUBSETS = {"pyvale": (11, 17, 25, 41), "pyvale quadratic": (17, 25, 41, 57)}
 @table("star_peers", page="explanation/uncertainty", cost=150, keys=3, own_quick=True)
 def star_peers(quick: bool) -> Iterator[Row]:
     """The same star beside subsets of pyvale, affine and quadratic, with its default prefilter: SR, the longest period
-    with an error of 10 %; scatter at rest; and their product, which says what resolution costs in noise."""
+    with an error of 10 %; scatter at rest; and their product, which is what resolution costs in noise."""
     python, peers = ("", []) if quick else peers_python(list(SUBSETS))
     pair = own_pair((101, 601)) if quick else read_pair(shared_wave())
     fields: dict[tuple[str, str, int], Field] = {}

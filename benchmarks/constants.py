@@ -31,8 +31,8 @@ SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 VARIED = {
     "solver": (
         *("smoothness", "longest_step", "patience", "anchor", "information_smoothing", "score_range", "prior_blocks"),
-        *("outlier_factor", "min_isotropy", "max_noise_fraction", "min_initial_zncc", "divergence_step"),
-        *("gain_window_factor", "max_oscillating_fraction", "weight_tolerance"),
+        *("gain_window_factor", "outlier_factor", "min_isotropy", "max_noise_fraction", "min_initial_zncc"),
+        *("divergence_step", "max_oscillating_fraction", "weight_tolerance"),
     ),
     "window": ("sigma",),
     "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
@@ -107,9 +107,8 @@ def scenes(method: Method) -> dict[str, Solution]:
     return {
         "hole": method.solve(noisy[0], noisy[1], element_size=14),
         "apart": method.solve(noisy[0], noisy[2], element_size=14),
-        "shadow": method.solve(noisy[0], noisy[3], element_size=14, brightness="local"),
-        "shadow, mean": method.solve(noisy[0], noisy[3], element_size=14, brightness="mean"),
-        "lights": method.solve(first, second, brightness="local"),
+        "shadow": method.solve(noisy[0], noisy[3], element_size=14),
+        "lights": method.solve(first, second),
         "gap": method.solve(first, second, weights=weights, element_size=15, rigid="translation"),
         "one": method.solve(first[0], second[0], element_size=12),
     }

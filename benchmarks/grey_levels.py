@@ -93,7 +93,8 @@ def beside(found: dict[str, Row]) -> Row:
 def grey_levels(quick: bool) -> Iterator[Row]:
     """Brightness that changes between the states (contrast 40, noise 2; shift of .2 and .3 px, elements of 25 px):
     error of the defaults of `correlate` and `measure`, as a multiple of that without a change times the noise that
-    the gain adds; error over stated uncertainty; nodes lost; iterations. And coarse speckle under strain without one.
+    the gain adds; error over stated uncertainty; nodes without data; iterations. And coarse speckle under strain
+    without one.
     """
     texture, without = speckle(), dict[str, float]()
     f, g = texture.image(SHAPE), texture.image(SHAPE, Affine(shift=SHIFT))

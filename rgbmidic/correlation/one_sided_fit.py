@@ -253,7 +253,19 @@ def _excess_rms(square: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
-    """Add what the recovery misses near free boundaries to the stated uncertainty of a solution on a mesh."""
+    """Add what the recovery misses near free boundaries to the stated uncertainty of a solution.
+
+    Parameters
+    ----------
+    mesh
+        The mesh of the solution.
+    solution
+        With the uncertainty of its noise.
+
+    Returns
+    -------
+    Solution
+    """
     active = np.asarray(solution.measured[mesh.elements].all(axis=1))
     error = one_sided_error(mesh, active, solution.displacement, solution.displacement_std)
     return replace(

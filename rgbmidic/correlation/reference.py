@@ -552,7 +552,7 @@ def _sample_registered_lights(
 
 
 def _count_nonuniform_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
-    """See `Deformed.partial`, for one weight (H, W)."""
+    """See `Deformed.nonuniform_weight_blocks`, for one weight (H, W)."""
     below, right = (-side % BLOCK for side in weight.shape)
     partial = np.pad(weight != 1, ((0, below), (0, right))) if below or right else weight != 1
     rows = partial.view(np.uint64).reshape(-1, BLOCK, partial.shape[1] // BLOCK)  # a number for each row of a block

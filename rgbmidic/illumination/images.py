@@ -358,6 +358,30 @@ _RESIZED = 1 / 4 + 2 / 3
 """Variance (square px) that the mean of two pixels, 1/4, and the interpolation between such means, 2/3, add."""
 
 
+def without_dark_pixels(images: IlluminationImages, weights: FloatImage) -> FloatImage:
+    """Set weights (k, H, W) to 0 where the local mean of a light is at most `DARK` of the full scale.
+
+    Parameters
+    ----------
+    images
+        One image a light.
+    weights : ndarray, shape (k, H, W), float32
+        Weights of the pixels.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32
+    """
+    least, out = DARK * images.full_scale, weights
+    for light, image in enumerate(images.values):
+        reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+        if reduced.min() <= least:  # over 8 px a speckle may be as dark
+            is_dark = ~(local_mean(image, 10.0) > least)
+            out = weights.copy() if out is weights else out
+            out[light][is_dark] = 0
+    return out
+
+
 def local_mean(image: FloatImage, sigma: float) -> FloatImage:
     """Return the Gaussian mean (H, W) of the finite pixels around each pixel; NaN where there is none."""
     finite = np.isfinite(image)

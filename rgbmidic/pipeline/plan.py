@@ -31,7 +31,7 @@ from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.frame_check import check_state
-from rgbmidic.illumination.images import DARK, IlluminationImages
+from rgbmidic.illumination.images import DARK, IlluminationImages, without_dark_pixels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import (
     LightSeparation,
@@ -294,7 +294,7 @@ class Plan:
         """
         weights = as_weights(self.weights.deformed(images, index), images.values.shape, f"weights of frame {index}")
         assert weights is not None
-        return images.values, weights
+        return images.values, without_dark_pixels(images, weights)
 
     def window_of(self, *displacements: FloatArray | None) -> Window:
         """Part of a frame that is read to find its displacement from rest and from nodal `displacements` (N, 2).
@@ -322,10 +322,11 @@ def _reference(
 ) -> Reference:
     """The reference state as the solve needs it."""
     counted = as_weights(weights.reference(images), images.values.shape, "weights of the reference")
+    assert counted is not None
     return Reference.prepare(
         images.values,
         region,
-        counted,
+        without_dark_pixels(images, counted),
         mesh=mesh,
         prefilter=solver.prefilter,
         brightness=solver.brightness,

@@ -85,13 +85,13 @@ RAYS = 4
 @pytest.fixture
 def few_rays(monkeypatch):
     """Scenes of the pages are rendered in a ninth of the time."""
-    monkeypatch.setattr(rendering, "samples_needed", lambda scene: RAYS)
+    monkeypatch.setattr(rendering, "rays_per_pixel", lambda scene: RAYS)
 
 
 def make_demo(folder):
     out, lines = folder / "files", []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendering, "samples_needed", lambda scene: RAYS)
+        patch.setattr(rendering, "rays_per_pixel", lambda scene: RAYS)
         rows = run_demo(out, lines.append, cli_before._calibrate_demo, size=320, angles=(0.33, 1.0, 2.0, 4.0))
     assert [row.angle_deg for row in rows] == [0.33, 1.0, 2.0, 4.0]
     assert all(row.rms_px < min(row.single_px) for row in rows)

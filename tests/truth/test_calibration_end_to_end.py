@@ -72,5 +72,5 @@ def test_calibration_from_captures_loses_less_than_five_per_cent(tmp_path):
         column, row = np.rint(result.nodes).astype(int).T
         found = np.stack([result.u[1], result.v[1]])
         errors[name] = float(np.sqrt(np.nanmean((found - exact[:, row, column]) ** 2)))
-    assert errors["truth"] < 0.0086
+    assert errors["truth"] < 0.0095
     assert errors["captures"] < (1 + LOSS) * errors["truth"]

@@ -188,7 +188,7 @@ def test_stress_intensity_factors_are_found_within_their_uncertainty():
     assert found.terms <= 5
     ratio = (found.factors - FACTORS) / found.factors_std
     assert COVERED[0] < np.sqrt(np.mean(ratio**2)) < COVERED[1]
-    assert 1 < found.chi_square.mean() < 1.3  # 1.19 measured: the nodes' own uncertainty is stated too small by a tenth
+    assert 0.9 < found.chi_square.mean() < 1.2  # .98 measured
     noisy_std = as_nodal(solutions[:1])
     still = replace(as_nodal([quiet]), u_std=noisy_std.u_std, v_std=noisy_std.v_std)
     exact = stress_intensity(*mesh, still, TIP, (34, 118), replace(MATERIAL, terms=found.terms))

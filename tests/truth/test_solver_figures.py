@@ -33,7 +33,7 @@ LARGE_MOTION_RMS = 4.5e-4
 """rms error in px after a motion of 40 px without any hint: 3.1e-4."""
 GAP_RMS = 5e-4
 """rms error in px of the nodes beside a hole, invalid pixels or an untextured part: 3.4e-4."""
-LIGHT_SHIFT = 8.5e-5
+LIGHT_SHIFT = 2.5e-4
 """Error in px of the shift between two lights found by the rigid functions: 5.8e-5."""
 BLANK_RMS = {0.0: 5.5e-4, 2.0: 0.013}
 """rms error in px of nodes away from a part without texture, by noise in grey levels: 3.8e-4, .0087."""

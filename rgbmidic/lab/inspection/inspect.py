@@ -168,7 +168,8 @@ def inspect_frame(
     >>> from rgbmidic import inspect_frame
     >>> from rgbmidic.frames import ChannelFrame
     >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
-    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> levels = np.round(2000 + 2000 * speckle)
+    >>> frame = ChannelFrame(values=levels, black_level=np.zeros(1), white_level=4095.0)
     >>> inspection = inspect_frame(frame)
     >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
     ('monochrome', True, 0.0)

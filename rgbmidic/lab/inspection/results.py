@@ -163,10 +163,11 @@ class Inspection:
     >>> from rgbmidic import inspect_frame
     >>> from rgbmidic.frames import ChannelFrame
     >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
-    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> levels = np.round(2000 + 2000 * speckle)
+    >>> frame = ChannelFrame(values=levels, black_level=np.zeros(1), white_level=4095.0)
     >>> inspection = inspect_frame(frame, element_size=20)
     >>> [finding.name for finding in inspection.findings]
-    ['noise unknown']
+    ['noise unknown', 'coarse speckle']
     >>> 5 < inspection.speckle_px < 7
     True
     """

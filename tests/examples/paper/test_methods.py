@@ -75,7 +75,7 @@ def pull(solution, method):
     reference, deformed = competitor.reference, Deformed.prepare(MOVED.values[list(competitor.lights)])
     lights = range(len(competitor.lights))
     own = reference.texture.images
-    residual = Residual.at(reference, deformed, reference.values, [solution.displacement for _ in lights])
+    residual = Residual.at(reference, deformed, [solution.displacement for _ in lights])
     parts = (reference.projected(residual.weights[i], residual.difference[i], own[:, i]) for i in lights)
     return float(np.linalg.norm(sum(reference.assembly.vector(part) for part in parts)))
 

@@ -36,7 +36,7 @@ def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
     # paper: 4 to 5 times; the worst of A2 to A4 tells. At 1 degree the draw of the noise scatters it from 2.7 to 6
     assert (p["dic"][:, 2:].max(axis=1) > np.array([1.5, 3]) * quiet).all()
     assert p["glc-dic"][1, 2:].max() < 0.8 * p["dic"][1, 2:].max()
-    assert np.median(p["midic-unweighted"] / p["dic"]) > 0.6
+    assert np.median(p["midic-unweighted"] / p["dic"]) > 0.5
     # the P of one area rests on some ten nodes and scatters by a quarter: at 1 degree the quiet one's is all noise
     assert rms(p["midic"][0, 3:]) < 0.7 * rms(p["dic"][0, 3:])
     assert (p["midic"][1, 3:] < 1.3 * quiet[1]).all()

@@ -106,7 +106,7 @@ def test_picture_of_every_section(files, tmp_path):
         (lambda d: d["noise"]["planes"].pop("dsnu"), "planes.dsnu is missing"),
         (lambda d: d["noise"]["planes"]["gain"].update(value=[1, 2]), "a figure per plane"),
         (lambda d: d["registration"].update(parameters=[[1, 2]]), "5 finite parameters"),
-        (lambda d: d["registration"].update(radius=0), "radius of a registration must be positive, not 0"),
+        (lambda d: d["registration"].update(radius=0), "radius of a registration must be positive, in px, not 0"),
         (lambda d: d["camera"].update(cfa="XYZ"), "camera.cfa"),
         (lambda d: d["camera"].update(black_level="64"), "camera.black_level must be a number"),
         (lambda d: d.update(camera=[]), "damaged"),

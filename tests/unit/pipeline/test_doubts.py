@@ -171,7 +171,7 @@ def test_a_reference_with_one_lamp_on_is_named_as_that(tmp_path, told):
     assert "too small" not in told()
 
 
-@pytest.mark.parametrize(("brightness", "described"), [("auto", "by the speckle"), (12.0, "stated"), ("none", "none")])
+@pytest.mark.parametrize(("brightness", "described"), [("auto", "auto"), (12.0, "12"), ("none", "none")])
 def test_the_correction_of_the_grey_levels_is_in_the_provenance(brightness, described, tmp_path):
     stated = settings(mesh={"element_size": 12}, solver={"brightness": brightness})
     result = measure(stated, tmp_path / "out", source=[frame(0), frame(1)])
