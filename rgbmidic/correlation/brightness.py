@@ -166,7 +166,9 @@ def gain_and_offset(
 ) -> tuple[FloatArray, FloatArray]:
     """Find the gain (k,) and the offset (k, 3) of each light, from elements that show the same texture in both states.
 
-    The gain is the ratio of the standard deviations, which noise that is alike in both states changes little.
+    The gain is the ratio of the standard deviations, which noise that is alike in both states changes little. It is NaN
+    for a light of which a tenth of the elements or fewer show the same, such as one that is off: chance alone makes
+    one in 60 correlate (`SolverConstants.min_gain_correlation`). Its offset is the difference of the means.
 
     Parameters
     ----------
@@ -177,13 +179,14 @@ def gain_and_offset(
     constants
         Of the solve.
     """
-    gains, offsets = np.ones(len(moments)), np.zeros((len(moments), 3))
+    gains, offsets = np.full(len(moments), np.nan), np.zeros((len(moments), 3))
     for light, sums in enumerate(moments):
         total, f, g, ff, fg, gg = sums.T
         total = np.maximum(total, 1e-30)
         ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
         is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(np.maximum(ff * gg, 0)))
-        if is_correlated.any():
+        offsets[light, 0] = (g.sum() - f.sum()) / total.sum()
+        if is_correlated.sum() > 0.1 * (ff > 0).sum():
             sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // _ELEMENTS]
             gain = np.sqrt(gg[sample] / ff[sample])
             gains[light] = np.median(gain)

@@ -335,9 +335,12 @@ class Reference:
         gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
         if self.brightness != "none":
             gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+        has_gain = np.isfinite(gain)
         fits: list[GainFit | None] = [None] * len(weights)
         if self.gain_window is not None:
             for light, (f, w) in enumerate(zip(self.values, weights, strict=True)):
+                if not has_gain[light]:
+                    continue
                 fit = self.gain_fits[light] if self.gain_fits else None
                 if fit is None or not np.array_equal(w, fit.weights):  # some pixels are saturated, or off the frame
                     fit = GainFit.over(f, w, self.pixels, self.gain_window)
@@ -346,7 +349,7 @@ class Reference:
             pixels=self.pixels,
             values=self.values,
             inverse_level=self.inverse_level,
-            gain=gain,
+            gain=np.where(has_gain, gain, 1.0),
             offset=offset,
             fits=tuple(fits),
             least_gain=self.constants.least_gain,

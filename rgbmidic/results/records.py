@@ -139,8 +139,8 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
 
     Examples
     --------
-    >>> FrameRecord.failed("too dark", nodes=2, lights=1).u
-    array([nan, nan])
+    >>> FrameRecord.failed("too dark", nodes=2, lights=1).u.tolist()
+    [nan, nan]
     """
 
     values: Mapping[str, Any]

@@ -57,8 +57,8 @@ class ResultStore:
     >>> origin = Origin(nodes=[[0, 0], [9, 0], [0, 9]], elements=[[0, 1, 2]], names=["a.png"], lights=["red"])
     >>> with ResultStore.create(f"{mkdtemp()}/result", origin) as store:
     ...     store.write_frame(0, FrameRecord.failed("too dark", nodes=3, lights=1))
-    >>> store.finished()
-    array([ True])
+    >>> store.finished().tolist()
+    [True]
     """
 
     path: Path
