@@ -76,9 +76,8 @@ def _star(table: Table) -> None:
 
 
 ABOVE_PYVALE = {
-    "challenge 5 by 0.1 px: contrast and offset",
-    *(f"pattern 7x {motion}: {size} px" for motion in ("translation", "tension", "shear") for size in (25, 40)),
-    *(f"whole pixels: {shift}" for shift in (1, 5, 10, 15)),
+    *(f"whole pixels: {shift}" for shift in (1, 5, 10, 15)),  # by 1e-6 px
+    "pattern 7x shear: 40 px",
     "rigid plate by 0.4 px",
 }
 """Public pairs whose default of `measure` has more than 1.03 of pyvale's error."""
