@@ -260,6 +260,7 @@ def _match(pictures: Mapping[str, FloatImage], region: Sequence[float] | None, e
             deformed,
             region=roi,
             element_size=element_size,
+            brightness="none",  # the pictures are over their local means
             initial=_cross_correlation_peak(reference, deformed),
         )
     except RgbmidicError as error:
