@@ -16,7 +16,7 @@ import numpy as np
 
 from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.constants import SolverConstants
-from rgbmidic.correlation.images import SlidingWindow
+from rgbmidic.correlation.images import SlidingWindow, window_sums
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
@@ -235,15 +235,21 @@ def window_width(
     constants
         Of the solve.
     """
-    sigma = float(max(pixels.bounds[2:]))
-    for _ in range(2):  # over the region at first, in which shading counts as speckle
-        lengths, window = [], SlidingWindow(sigma=sigma)
-        for f, gx, gy, w in zip(values, *gradient, weights, strict=True):
-            fields = np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w])
-            mean, square, slope = window.ratios(pixels, fields).astype(np.float64)
+    step = SlidingWindow().step
+    grids = [
+        pixels.block_sums(np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w]), step).astype(np.float64)
+        for f, gx, gy, w in zip(values, *gradient, weights, strict=True)
+    ]
+
+    def width(moments: list[FloatArray]) -> float:
+        lengths = []
+        for f, ff, slope, total in moments:
             if (textured := slope > 0).any():
-                variance = np.maximum(square - mean * mean, 0)
-                lengths.append(float(np.sqrt(np.median(variance[textured] / slope[textured]))))
+                f, ff, slope, total = f[textured], ff[textured], slope[textured], total[textured]
+                lengths.append(np.sqrt(np.median(np.maximum(ff - f * f / total, 0) / slope)))
         length = float(np.median(lengths)) if lengths else 0.0
-        sigma = max(constants.gain_window_factor * length, constants.min_gain_window)
-    return sigma
+        return max(constants.gain_window_factor * length, constants.min_gain_window)
+
+    # over the region at first, in which shading counts as speckle
+    sigma = width([grid.sum(axis=(1, 2))[:, None] for grid in grids])
+    return width([np.stack([window_sums(one, sigma / step) for one in grid]) for grid in grids])
