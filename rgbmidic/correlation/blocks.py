@@ -70,7 +70,7 @@ class BlockTable:
         """Sum all lights together, over blocks that grow with the elements."""
         reference = residual.reference
         side = block_side(reference.pixels, reference.mesh.size, reference.constants)
-        relative = reference.values / reference.level
+        relative = reference.relative_values
         return cls.of(reference, side, [(residual.difference, weights, *reference.gradient, relative, relative)])
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:

@@ -14,9 +14,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import SlidingWindow, window_sums
+from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
@@ -92,6 +92,15 @@ class GainFit:
         return np.asarray(field - gain * values)
 
 
+def local_gain_fits(
+    values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float | None
+) -> tuple[GainFit, ...]:
+    """Prepare the local gain over grey levels (k, P) in a window of `sigma` px; none where the gain is one number."""
+    if sigma is None:
+        return ()
+    return tuple(GainFit.over(f, w, pixels, sigma) for f, w in zip(values, weights, strict=True))
+
+
 def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
     """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) of blocks in a window of `sigma` blocks."""
     rows, columns = np.arange(len(sums), dtype=np.float64)[:, None], np.arange(sums.shape[1], dtype=np.float64)
@@ -117,44 +126,34 @@ class Brightness:
 
     Attributes
     ----------
-    pixels
-        P owned pixels of the reference.
-    values, inverse_level : ndarray, shape (k, P), float32
-        Grey levels of the reference, and one over their local mean, the unit of the residual.
     gain : ndarray, shape (k,)
         Of each light; 1 where it shows nothing.
     offset : ndarray, shape (k, 3)
         Of each light: its constant, and its slopes along the columns and rows of the rectangle around the pixels.
     fits : tuple
         `GainFit` of each light's local gain; None where the gain is one number.
-    least_gain
-        Least local gain over that of the light.
     """
 
-    pixels: PixelMap
-    values: FloatImage
-    inverse_level: FloatImage
     gain: FloatArray
     offset: FloatArray
     fits: tuple[GainFit | None, ...]
-    least_gain: float
 
-    def correct(self, light: int, difference: FloatImage) -> None:
-        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
+    def inverse_gain(self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float) -> FloatImage:
+        """Return 1 / a of a light over the rectangle of `shape` around the pixels, from its difference f - g (P,).
 
-        The local gain is that of these very grey levels, so that a displacement leaves no gain behind.
+        The local gain is that of these very grey levels, so that a displacement leaves no gain behind. It is at least
+        `min_ratio` of the light's gain.
         """
         fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
-        local, side = np.full((1, 1), gain, dtype=np.float32), max(self.pixels.bounds[2:])
-        if fit is not None:
-            side = fit.side
-            rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
-            plane = offset[0] + offset[1] * ((columns + 0.5) * side - 0.5) + offset[2] * ((rows + 0.5) * side - 0.5)
-            local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
-        grid = 1 / np.maximum(local, np.float32(self.least_gain * gain))
-        scales = cv2.resize(grid, (grid.shape[1] * side, grid.shape[0] * side), interpolation=cv2.INTER_LINEAR)
-        fields = self.values[light], self.inverse_level[light], scales
-        correct_brightness(self.pixels.lines, *fields, offset, difference)
+        if fit is None:
+            return np.full(shape, 1 / gain, dtype=np.float32)
+        rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
+        x, y = (columns + 0.5) * fit.side - 0.5, (rows + 0.5) * fit.side - 0.5
+        plane = offset[0] + offset[1] * x + offset[2] * y
+        local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
+        grid = 1 / np.maximum(local, np.float32(min_ratio * gain))
+        size = grid.shape[1] * fit.side, grid.shape[0] * fit.side
+        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
 
 
 _ELEMENTS = 300
@@ -202,18 +201,21 @@ def _offset_plane(points: FloatArray, values: FloatArray) -> FloatArray:
     """
     middle, size = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1.0)
     basis = np.c_[np.ones(len(points)), (points - middle) / size]
-    plane = np.array([np.median(values), 0.0, 0.0])
-    for _ in range(5):  # until the weights have settled
-        scatter = 1.5 * float(np.median(np.abs(values - basis @ plane)))  # standard deviation of a normal distribution
-        if len(points) < 12 or not scatter:  # four elements for each unknown
+    plane, scatter = np.array([np.median(values), 0.0, 0.0]), _scatter(values - np.median(values))
+    for _ in range(3 if len(points) >= 12 else 0):  # of four elements for each unknown, until the scatter has settled
+        if not scatter:
             break
-        weighted = basis / (1 + ((values - basis @ plane) / scatter) ** 2)[:, None]
-        held = 1e-3 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0])  # slopes that elements on a line do not show
-        plane = np.linalg.solve(weighted.T @ basis + held, weighted.T @ values)
+        plane = robust_fit(basis[None], values[None, :, None], 1e-3 * len(points), scatter)[0, :, 0]
+        scatter = _scatter(values - basis @ plane)
     square = float(((basis @ plane) ** 2).mean())
     plane = plane * square / max(square + scatter**2, 1e-300)
     slopes = plane[1:] / size
     return np.array([plane[0] - slopes @ middle, *slopes])
+
+
+def _scatter(values: FloatArray) -> float:
+    """Return the standard deviation of a normal distribution with the same median of the absolute values."""
+    return 1.5 * float(np.median(np.abs(values)))
 
 
 def window_width(

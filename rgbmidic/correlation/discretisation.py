@@ -23,6 +23,7 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
+from rgbmidic.correlation.brightness import local_gain_fits
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, gauss_newton_step
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
@@ -366,13 +367,13 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             target[:] = pixels.gather(old.scatter(row))
         return out
 
-    names = "values", "level", "inverse_level", "gradient", "pixel_weights"
+    names = "values", "inverse_level", "gradient", "pixel_weights"
     fields: dict[str, Any] = {name: resample(getattr(reference, name)) for name in names}
     texture = reference.texture
     fields["texture"] = replace(texture, images=resample(texture.images), texture=resample(texture.texture))
-    return replace(
-        reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), gain_fits=(), **fields
-    )
+    images = fields["values"], fields["pixel_weights"], pixels
+    fields |= {"gain_fits": local_gain_fits(*images, reference.gain_window), "assembly": Assembly.from_mesh(mesh)}
+    return replace(reference, mesh=mesh, material=mesh, pixels=pixels, **fields)
 
 
 def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:

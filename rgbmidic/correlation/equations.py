@@ -386,7 +386,7 @@ def _right_sides(
         else:
             warp_arguments = reference.warp(problem.deformed, light, displacement)
             differences(problem.deformed.coefficients[light], reference.values[light], *warp_arguments, difference)
-            brightness.correct(light, difference)
+            reference.correct_brightness(brightness, light, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
         total += vector

@@ -17,11 +17,18 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
+from rgbmidic._kernels.owned_pixels import add_second_derivatives, correct_brightness, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
-from rgbmidic.correlation.brightness import Brightness, BrightnessModel, GainFit, gain_and_offset, window_width
+from rgbmidic.correlation.brightness import (
+    Brightness,
+    BrightnessModel,
+    GainFit,
+    gain_and_offset,
+    local_gain_fits,
+    window_width,
+)
 from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.images import (
     SlidingWindow,
@@ -169,12 +176,12 @@ class Reference:
         Fraction of the variance of a block's score that the fit leaves in the residual (`mean_residual_leverage`).
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
-    level, inverse_level : ndarray, shape (k, P), float32
-        Local mean of `values`, in units of which residual and gradient are, and one over it.
-    brightness, gain_window
-        ``solver.brightness``, and the standard deviation (px) of the window of the gain; None where that is one number.
+    inverse_level : ndarray, shape (k, P), float32
+        One over the local mean of `values`, in units of which residual and gradient are.
+    brightness
+        ``solver.brightness``.
     gain_fits : tuple of GainFit
-        Of each light's gain with the `pixel_weights`; empty where they are not kept.
+        Of each light's local gain with the `pixel_weights`; empty where the gain is one number.
     gradient : ndarray, shape (2, k, P), float32
         Gradient of the texture common to the lights, as each shows it, in its `level` per px; without what is a gain.
     texture : TextureGradient
@@ -194,9 +201,7 @@ class Reference:
     images: FloatImage
     weights: FloatImage
     values: FloatImage
-    level: FloatImage
     inverse_level: FloatImage
-    gain_window: float | None
     gain_fits: tuple[GainFit, ...]
     brightness: BrightnessModel
     gradient: FloatImage
@@ -284,12 +289,10 @@ class Reference:
             sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
         weighted *= level > DARK * level.max(axis=1, keepdims=True)
-        inverse_level, fits = np.float32(1) / level, tuple[GainFit, ...]()
-        if sigma is not None:  # what a gain may be is no displacement
-            fits = tuple(GainFit.over(f, w, pixels, sigma) for f, w in zip(values, weighted, strict=True))
-            for light, fit in enumerate(fits):
-                for axis in light_gradient[:, light]:
-                    axis[:] = fit.remainder(axis, values[light])
+        inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
+        for light, fit in enumerate(fits):
+            for axis in light_gradient[:, light]:
+                axis[:] = fit.remainder(axis, values[light])  # what a gain may be is no displacement
         light_gradient *= inverse_level
         texture = TextureGradient.of_images(light_gradient, weighted, pixels, constants.gradient_correlation_bounds)
         gradient = texture.matched(pixels)
@@ -305,9 +308,7 @@ class Reference:
             images=prepared_images,
             weights=usable,
             values=values,
-            level=level,
             inverse_level=inverse_level,
-            gain_window=sigma,
             gain_fits=fits,
             brightness=brightness,
             gradient=gradient,
@@ -337,23 +338,40 @@ class Reference:
             gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
         has_gain = np.isfinite(gain)
         fits: list[GainFit | None] = [None] * len(weights)
-        if self.gain_window is not None:
-            for light, (f, w) in enumerate(zip(self.values, weights, strict=True)):
-                if not has_gain[light]:
-                    continue
-                fit = self.gain_fits[light] if self.gain_fits else None
-                if fit is None or not np.array_equal(w, fit.weights):  # some pixels are saturated, or off the frame
-                    fit = GainFit.over(f, w, self.pixels, self.gain_window)
-                fits[light] = fit
-        return Brightness(
-            pixels=self.pixels,
-            values=self.values,
-            inverse_level=self.inverse_level,
-            gain=np.where(has_gain, gain, 1.0),
-            offset=offset,
-            fits=tuple(fits),
-            least_gain=self.constants.least_gain,
-        )
+        for light, fit in enumerate(self.gain_fits):
+            if has_gain[light]:
+                f, w = self.values[light], weights[light]
+                # other weights where pixels are saturated, or off the frame
+                same = np.array_equal(w, fit.weights)
+                fits[light] = fit if same else GainFit.over(f, w, self.pixels, fit.sigma)
+        return Brightness(gain=np.where(has_gain, gain, 1.0), offset=offset, fits=tuple(fits))
+
+    def correct_brightness(self, brightness: Brightness, light: int, difference: FloatImage) -> None:
+        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
+
+        Parameters
+        ----------
+        brightness
+            Of the deformed images.
+        light
+            Index of the light.
+        difference : ndarray, shape (P,), float32
+            Of the grey levels; becomes the residual.
+        """
+        _, _, *shape = self.pixels.bounds
+        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
+        fields = self.values[light], self.inverse_level[light], scales, brightness.offset[light]
+        correct_brightness(self.pixels.lines, *fields, difference)
+
+    @property
+    def gain_window(self) -> float | None:
+        """Standard deviation (px) of the window of the gain; None where the gain is one number."""
+        return self.gain_fits[0].sigma if self.gain_fits else None
+
+    @property
+    def relative_values(self) -> FloatImage:
+        """Grey levels (k, P) over their local means."""
+        return self.values * self.inverse_level
 
     def channel_specific(self, light: int) -> FloatImage:
         """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
@@ -397,7 +415,8 @@ class Reference:
         add_second_derivatives(
             factors, self.images, self.pixels.lines, self.pixels.run_offsets, first_row, first_column, values
         )
-        return replace(self, values=values, gain_fits=())
+        fits = local_gain_fits(values, self.pixel_weights, self.pixels, self.gain_window)
+        return replace(self, values=values, gain_fits=fits)
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.

@@ -19,6 +19,7 @@ from rgbmidic._kernels.correlation import differences, element_squares, warped_w
 from rgbmidic._kernels.owned_pixels import subtract_quadratic
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -74,7 +75,7 @@ class Residual:
             warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
         brightness = reference.brightness_of(weights, moments)
         for light, light_difference in enumerate(difference):
-            brightness.correct(light, light_difference)
+            reference.correct_brightness(brightness, light, light_difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -316,32 +317,14 @@ def interpolate_motion(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, s
     nodes = mesh.nodes
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
     basis, at_nodes = (np.c_[np.ones(len(positions)), (positions - middle) / size] for positions in (points, nodes))
-    affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
+    affine = robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
     remainder = motion - basis @ affine
     distance, near = map(
         np.asarray, cKDTree(points).query(mesh.observation_points, k=[*range(1, min(_FITTED_PAIRS, len(points)) + 1)])
     )
     step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
     local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
-    return np.asarray(at_nodes @ affine + _robust_fit(local, remainder[near], 0.3, scale)[:, 0])
-
-
-def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
-    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
-
-    The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
-    """
-    basis, motion = (np.ascontiguousarray(values.T) for values in (basis, motion))  # one fit beside the other in memory
-    weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
-    for _ in range(5):  # until the weights have settled: twice as many change results by 1e-11 px
-        # no BLAS, whose sums may depend on the number of threads
-        sums = np.array([[(values * side).sum(axis=0) for side in (*basis, *motion)] for values in basis * weight])
-        coefficients = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
-        fitted = sum(
-            values * slope[:, None] for values, slope in zip(basis, coefficients.transpose(1, 2, 0), strict=True)
-        )
-        weight = 1 / (1 + ((motion - fitted) ** 2).sum(axis=0) / scale**2)
-    return coefficients
+    return np.asarray(at_nodes @ affine + robust_fit(local, remainder[near], 0.3, scale)[:, 0])
 
 
 def refine_by_patch_matching(residual: Residual, displacement: FloatArray) -> FloatArray:
@@ -403,7 +386,7 @@ def _reduced(residual: Residual, side: int, border: int) -> FloatImage:
     count = pixels.block_sums(weights, side)
     level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
     pictures = []
-    f = residual.reference.values / residual.reference.level
+    f = residual.reference.relative_values
     for values in (f, f - residual.difference):
         sums = pixels.block_sums(values * weights, side)
         mean = sums.sum(axis=(1, 2), dtype=np.float64)[:, None, None] / np.maximum(level, 1e-30)

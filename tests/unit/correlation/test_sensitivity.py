@@ -95,7 +95,9 @@ def test_lost_nodes_take_nothing_from_the_uncertainty_of_those_probed_with_them(
     nodes = equations.observability > USUAL.min_information / USUAL.min_texture
     recovery = Recovery.over(mesh, nodes[mesh.elements].all(axis=1), equations.information(reference))
     few = reference.sums(seen, seen[0])[0, :, 0] < 25
-    scores = 10 / reference.level.mean() ** 2 * equations.blocks * np.where(few, variance, 1)[:, None, None, None]
+    scores = (
+        10 * reference.inverse_level.mean() ** 2 * equations.blocks * np.where(few, variance, 1)[:, None, None, None]
+    )
     asked = [((recovery.value, None), nodes), ((None, recovery.value), nodes)]
     found = uncertainty._probed_std(equations, scores, reference, asked)[nodes, 0]
     column = np.zeros((len(mesh.nodes), 2, int(nodes.sum())))
