@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from rgbmidic.correlation.constants import SolverConstants
-from rgbmidic.correlation.images import SlidingWindow, window_sums
+from rgbmidic.correlation.images import SlidingWindow, centred_products, window_sums
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -180,10 +180,9 @@ def gain_and_offset(
     """
     gains, offsets = np.full(len(moments), np.nan), np.zeros((len(moments), 3))
     for light, sums in enumerate(moments):
-        total, f, g, ff, fg, gg = sums.T
+        (total, f, g, *_), (fg, ff, gg) = sums.T, centred_products(sums)
         total = np.maximum(total, 1e-30)
-        ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
-        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(np.maximum(ff * gg, 0)))
+        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(ff * gg))
         offsets[light, 0] = (g.sum() - f.sum()) / total.sum()
         if is_correlated.sum() > 0.1 * (ff > 0).sum():
             sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // _ELEMENTS]

@@ -28,7 +28,7 @@ from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
-from rgbmidic.correlation.recovery import Recovery, at_free_boundary, nodal_slopes
+from rgbmidic.correlation.recovery import Recovery, at_free_boundary, slope_operators
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
@@ -274,7 +274,7 @@ class _RefinedMesh:
     def interpolated(self, nodal: FloatArray, active: BoolArray) -> FloatArray:
         """Interpolate a displacement (N, 2) at the nodes of the finer mesh, as everywhere between nodes."""
         ends = self.mesh.neighbours
-        slopes = np.stack([operator @ nodal for operator in nodal_slopes(self.mesh, active)], axis=-1)[ends]
+        slopes = np.stack([operator @ nodal for operator in slope_operators(self.mesh, active)], axis=-1)[ends]
         arm = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
         sag = np.einsum("ncd,nd->nc", slopes[:, 1] - slopes[:, 0], arm) / 8
         return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])

@@ -112,6 +112,17 @@ def spline_values(coefficients: FloatImage) -> FloatImage:
     return np.stack([cv2.sepFilter2D(spline, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for spline in coefficients])
 
 
+def centred_products(moments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sum f g, f f and g g of what f and g are beyond their means, from moments (..., 6) as of `Residual`, (...)."""
+    total, f, g, ff, fg, gg = np.moveaxis(moments, -1, 0)
+    total, rounding = np.maximum(total, 1e-30), 2e-7  # three units of single precision
+    beyond_f, beyond_g = (
+        np.where(deviation > rounding * square, deviation, 0.0)
+        for deviation, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
+    )
+    return fg - f * g / total, beyond_f, beyond_g
+
+
 def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
     """Sum a grid (h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grid there is nothing."""
     return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.correlation import element_hessian
 from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.images import centred_products
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
@@ -198,7 +199,7 @@ def _centred_products(residual: Residual, precision: Precision | None) -> FloatA
 
     Lights count by their mean precision in the element over that of the most precise; alike where it is not known.
     """
-    products = np.array(residual.centred_products())
+    products = np.array(centred_products(residual.moments))
     if precision is not None and len(residual.weights) > 1:
         mean = residual.reference.sums(precision.factor, precision.loss_curvature)[..., 0]
         products *= mean / np.maximum(mean.max(axis=0), 1e-300)

@@ -189,7 +189,7 @@ def quadratic_fit(
     return tuple(with_data(structure, fits[:, term].ravel()[entries]) for term in range(6))
 
 
-def nodal_slopes(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+def slope_operators(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """Linear operators (N, N) from nodal values to the slopes along x and y with which the field is interpolated.
 
     The slope at a node is the mean, by the areas of the elements between, of what the quadratics of the nodes beside it

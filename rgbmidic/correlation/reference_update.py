@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.correlation.assembly import rigid_functions
-from rgbmidic.correlation.images import usable_reach
+from rgbmidic.correlation.images import centred_products, usable_reach
 from rgbmidic.correlation.nodes import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, rasterise_lines
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
@@ -177,7 +177,7 @@ class ReferenceUpdate:
             From -1 to 1.
         """
         residual, has_displacement = _residual(self.reference, deformed, *self._step(solution.displacement, solution))
-        lights = zip(*residual.centred_products(), strict=True)
+        lights = zip(*centred_products(residual.moments), strict=True)
         coefficients = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
         best = np.where(residual.moments[..., 0] > 0, coefficients, -np.inf).max(axis=0)
         return np.where(has_displacement & (best > -np.inf), best, np.nan)

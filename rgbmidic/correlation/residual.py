@@ -105,21 +105,6 @@ class Residual:
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
-    def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Sum f g, f f and g g over each element, of what f and g are beyond their means in it, (k, E).
-
-        Returns
-        -------
-        fg, ff, gg : ndarray, shape (k, E)
-        """
-        total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
-        total, rounding = np.maximum(total, 1e-30), 2e-7  # three units of single precision
-        beyond_f, beyond_g = (
-            np.where(deviation > rounding * square, deviation, 0.0)
-            for deviation, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
-        )
-        return fg - f * g / total, beyond_f, beyond_g
-
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
 

@@ -1,8 +1,8 @@
 """The field between the nodes of a mesh: points, pixels and the weights of the nodes there.
 
 In an element it is ``sum phi_a (u_a + slope_a . (x - x_a) / 2)`` over its corners, with slopes from the quadratics
-around (`nodal_slopes`): continuous, linear in the nodal values and exact for quadratic fields; along an edge it is the
-cubic through values and slopes of both ends.
+around (`slope_operators`): continuous, linear in the nodal values and exact for quadratic fields; along an edge it is
+the cubic through values and slopes of both ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.arguments import checked
-from rgbmidic.correlation.recovery import nodal_slopes
+from rgbmidic.correlation.recovery import slope_operators
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.renamed import state_new_names
@@ -354,7 +354,7 @@ class PointSum:
 def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     """Matrices (N, N) from nodal values to the value at each node and to its slopes along x and y."""
     is_complete = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))
-    return sp.eye(len(mesh.nodes), format="csr"), *nodal_slopes(mesh, is_complete)
+    return sp.eye(len(mesh.nodes), format="csr"), *slope_operators(mesh, is_complete)
 
 
 @checked

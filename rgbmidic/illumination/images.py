@@ -352,6 +352,8 @@ class IlluminationImages:
 
 DARK = 0.01
 """A light whose local mean is below this fraction of the full scale does not see the surface there."""
+_DARK_WINDOW = 10.0
+"""Standard deviation (px) of the window of that mean: two to three speckles."""
 _WIDE = 4.0
 """Standard deviation (px) from which an image of half the size gives the mean: as good, at a sixth of the time."""
 _RESIZED = 1 / 4 + 2 / 3
@@ -372,11 +374,11 @@ def without_dark_pixels(images: IlluminationImages, weights: FloatImage) -> Floa
     -------
     ndarray, shape (k, H, W), float32
     """
-    least, out = DARK * images.full_scale, weights
+    threshold, out = DARK * images.full_scale, weights
     for light, image in enumerate(images.values):
         reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
-        if reduced.min() <= least:  # over 8 px a speckle may be as dark
-            is_dark = ~(local_mean(image, 10.0) > least)
+        if reduced.min() <= threshold:  # else no mean over a wider window is
+            is_dark = ~(local_mean(image, _DARK_WINDOW) > threshold)
             out = weights.copy() if out is weights else out
             out[light][is_dark] = 0
     return out
