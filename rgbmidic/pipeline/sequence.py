@@ -149,6 +149,8 @@ def solver_settings(options: SolverOptions) -> sections.SolverSettings:
     InputError
         An option is unknown or out of range.
     """
+    if "normalise" in options:
+        raise InputError('"normalise" is no option any more: brightness is a width in px, "auto", "constant" or "none"')
     try:
         check_names(options, (entry.name for entry in fields(sections.SolverSettings)), "option", "correlate")
         return sections.SolverSettings(**options)

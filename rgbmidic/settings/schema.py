@@ -394,27 +394,50 @@ def read_test(path: Path | str) -> TestSettings:
         raise ConfigurationError(f"{path}: {error}") from None
 
 
+_FORMER_BRIGHTNESS = {"global": "constant", "local": "auto", "mean": "auto"}
+
+
 def without_former_keys(document: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the sections with the grey-level keys of former versions replaced by ``solver.brightness``.
 
     ``illumination.normalise`` divided each image by its local mean in its own frame; ``solver.brightness`` was
     ``"global"``, ``"local"`` or ``"mean"``. What they mean now is logged.
+
+    Raises
+    ------
+    ConfigurationError
+        ``illumination.normalise`` is neither a width nor ``"auto"``, or stands beside a new value of the other key.
     """
-    illumination, solver = document.get("illumination"), document.get("solver", {})
-    brightness = solver.get("brightness") if isinstance(solver, Mapping) else None
-    former = {"global": "constant", "local": "auto", "mean": "auto"}
-    changes: dict[str, Any] = {}
-    new = former.get(brightness, brightness) if isinstance(brightness, str) else brightness
-    if isinstance(illumination, Mapping) and "normalise" in illumination:
+    illumination, solver = document.get("illumination", {}), document.get("solver", {})
+    if not isinstance(illumination, Mapping) or not isinstance(solver, Mapping):
+        return document
+    stated = solver.get("brightness", "auto")
+    is_former = isinstance(stated, str) and stated in _FORMER_BRIGHTNESS
+    if "normalise" not in illumination and not is_former:
+        return document
+    brightness = _FORMER_BRIGHTNESS[stated] if is_former else stated
+    if "normalise" in illumination:
         width = illumination["normalise"]
-        changes["illumination"] = {key: value for key, value in illumination.items() if key != "normalise"}
+        is_width = isinstance(width, int | float) and not isinstance(width, bool) and 0 <= width <= 10_000
+        if not (is_width or width == "auto"):
+            raise ConfigurationError(
+                f'illumination.normalise, now solver.brightness, must be a width in px or "auto", not {width!r}'
+            )
+        if not is_former and stated not in ("auto", "none"):
+            raise ConfigurationError(
+                f"illumination.normalise = {width!r} and solver.brightness = {stated!r} contradict each other: the "
+                "former is now the latter, state only solver.brightness"
+            )
         if width == 0:
-            new = {None: "none", "auto": "auto" if brightness in former else "none"}.get(new, new)
-        elif new in (None, "auto", "none"):
-            new = width
-        logger.warning("illumination.normalise = %r is no key any more: solver.brightness = %r is used", width, new)
-    elif new != brightness:
-        logger.warning('solver.brightness = "%s" is now "%s", which is used', brightness, new)
-    if new == brightness:
-        return {**document, **changes}
-    return {**document, **changes, "solver": {**solver, "brightness": new}}
+            brightness = brightness if is_former else "none"
+        elif stated != "global" and width != "auto":
+            brightness = max(width, 2.0)
+        elif not is_former:
+            brightness = "auto"
+        logger.warning(
+            "illumination.normalise = %r is no key any more: solver.brightness = %r is used", width, brightness
+        )
+        illumination = {key: value for key, value in illumination.items() if key != "normalise"}
+    else:
+        logger.warning('solver.brightness = "%s" is now "%s", which is used', stated, brightness)
+    return {**document, "illumination": illumination, "solver": {**solver, "brightness": brightness}}

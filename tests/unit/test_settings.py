@@ -450,6 +450,22 @@ def test_former_keys_of_the_grey_levels_are_read(
     assert f"{now!r}".strip("'").removesuffix(".0") in warning
 
 
+@pytest.mark.parametrize(
+    ("normalise", "brightness", "message"),
+    [
+        ("x", "auto", "illumination.normalise, now solver.brightness, must be a width"),
+        (-1, "auto", "must be a width"),
+        (5, 20, "contradict each other"),
+        (5, "constant", "contradict each other"),
+    ],
+)
+def test_former_keys_that_are_wrong_or_contradict_are_refused(normalise: Any, brightness: Any, message: str) -> None:
+    document = {"frames": {"path": "*.tif"}, "region": {"rectangle": [0, 0, 9, 9]}}
+    more = {"illumination": {"normalise": normalise}, "solver": {"brightness": brightness}}
+    with pytest.raises(ConfigurationError, match=message):
+        TestSettings.from_mapping({**document, **more})
+
+
 def test_a_wrong_number_is_told_at_construction_by_its_field() -> None:
     with pytest.raises(ConfigurationError, match=r'solver\.tolerance must be a number, not "1e-3"'):
         SolverSettings(tolerance="1e-3")  # type: ignore[arg-type]
