@@ -128,20 +128,21 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets
 
 
 @compiled("lines", fastmath=FAST)
-def correct_brightness(start, stop, lines, reference, inverse_level, scales, offset, difference):
+def correct_brightness(start, stop, lines, reference, inverse_level, scales, border, offset, difference):
     """Correct the `difference` f - g of one light: it becomes ``(f - scale (g - b)) inverse_level``.
 
-    The scale is that of the image `scales` (H, W) over the rectangle around the pixels. The `offset` b has a constant
-    and slopes along columns and rows; the other fields are (P,) float32.
+    The scale is that of the image `scales` (H, W) over the rectangle around the pixels and a `border` of so many px.
+    The `offset` b has a constant and slopes along columns and rows; the other fields are (P,) float32.
     """
     for q in range(start, stop):
         first, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
         row, column = np.uint64(lines[q, 2]), np.uint64(lines[q, 3])
+        at, from_column = row + np.uint64(border), column + np.uint64(border)
         b, slope = np.float32(offset[0] + offset[2] * row + offset[1] * column), np.float32(offset[1])
         for i in range(number):
             f = reference[first + i]
             g = f - difference[first + i] - (b + slope * np.float32(np.int32(i)))
-            difference[first + i] = (f - scales[row, column + i] * g) * inverse_level[first + i]
+            difference[first + i] = (f - scales[at, from_column + i] * g) * inverse_level[first + i]
 
 
 @compiled("out", axis=1, fastmath=FAST)

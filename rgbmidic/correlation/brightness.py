@@ -64,8 +64,9 @@ class GainFit:
         (sums,) = pixels.weighted_block_sums(values[None], weights, side)
         (totals,) = pixels.block_sums(weights[None], side)
         total, x, y, xx, xy, yy = _moments(sums, sigma / side, 2)
-        # a ridge of a tenth of the window's variance: beside gaps too narrow for a slope the mean counts
-        spread = 0.1 * (sigma / side) ** 2 * total
+        # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With
+        # a tenth a slope of the light is followed too little at edges: coarse speckle errs there by twice as much
+        spread = 0.005 * (sigma / side) ** 2 * total
         xx, yy = xx + spread, yy + spread
         cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
         determinant = (cofactors * (total, x, y)).sum(axis=0)
@@ -138,22 +139,28 @@ class Brightness:
     offset: FloatArray
     fits: tuple[GainFit | None, ...]
 
-    def inverse_gain(self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float) -> FloatImage:
-        """Return 1 / a of a light over the rectangle of `shape` around the pixels, from its difference f - g (P,).
+    def inverse_gain(
+        self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float
+    ) -> tuple[FloatImage, int]:
+        """Return 1 / a of a light from its difference f - g (P,), and the width of the border around it.
 
-        The local gain is that of these very grey levels, so that a displacement leaves no gain behind. It is at least
-        `min_ratio` of the light's gain.
+        It is that of the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so
+        that a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
         """
         fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
         if fit is None:
-            return np.full(shape, 1 / gain, dtype=np.float32)
+            return np.full(shape, 1 / gain, dtype=np.float32), 0
         rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
         x, y = (columns + 0.5) * fit.side - 0.5, (rows + 0.5) * fit.side - 0.5
         plane = offset[0] + offset[1] * x + offset[2] * y
         local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
-        grid = 1 / np.maximum(local, np.float32(min_ratio * gain))
+        grid, largest = 1 / np.maximum(local, np.float32(min_ratio * gain)), 1 / (min_ratio * gain)
+        if min(grid.shape) > 1:  # linear beyond the centres of the outermost blocks, too
+            grid = np.clip(np.pad(grid, 1, mode="reflect", reflect_type="odd"), 0, largest, dtype=np.float32)
+        else:
+            grid = np.pad(grid, 1, mode="edge")
         size = grid.shape[1] * fit.side, grid.shape[0] * fit.side
-        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
+        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), fit.side
 
 
 _ELEMENTS = 300

@@ -359,8 +359,8 @@ class Reference:
             Of the grey levels; becomes the residual.
         """
         _, _, *shape = self.pixels.bounds
-        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
-        fields = self.values[light], self.inverse_level[light], scales, brightness.offset[light]
+        scales, border = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
+        fields = self.values[light], self.inverse_level[light], scales, border, brightness.offset[light]
         correct_brightness(self.pixels.lines, *fields, difference)
 
     @property

@@ -8,7 +8,7 @@ from textures import Affine, Texture
 
 from rgbmidic import Status, correlate
 from rgbmidic._kernels.owned_pixels import correct_brightness
-from rgbmidic.correlation.brightness import GainFit, gain_and_offset
+from rgbmidic.correlation.brightness import Brightness, GainFit, gain_and_offset
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -52,16 +52,18 @@ def test_a_change_of_light_costs_nothing():
         assert passes <= iterations + 2
 
 
-def test_a_gain_that_is_linear_in_the_window_is_found_at_every_edge(pixels):
-    random = np.random.default_rng(0)
+def test_a_gain_that_is_linear_is_found_up_to_every_edge(pixels):
+    random, shape = np.random.default_rng(0), pixels.bounds[2:]
     values = random.uniform(50, 150, pixels.columns.size).astype(np.float32)
     gain = 0.5 + 0.004 * pixels.columns + 0.003 * pixels.rows
     fit = GainFit.over(values, np.ones_like(values), pixels, 10.0)
-    found = fit.gain(fit.block_sums((gain * values).astype(np.float32)))
-    # the ridge holds a twentieth of the slope at an edge, and beyond the last block's centre the gain is that of it
-    np.testing.assert_allclose(pixels.from_blocks(found[None], 8)[0], gain, rtol=0.06)
-    left = fit.remainder((gain * values).astype(np.float32), values)
-    assert np.abs(left).max() < 0.06 * 150 * gain.max()
+    field = (gain * values).astype(np.float32)
+    assert np.abs(fit.remainder(field, values)).max() < 0.05 * field.max()
+    brightness = Brightness(gain=np.ones(1), offset=np.zeros((1, 3)), fits=(fit,))
+    inverse, border = brightness.inverse_gain(0, values - field, shape, 0.05)
+    top, left = pixels.bounds[:2]
+    found = 1 / inverse[pixels.rows - top + border, pixels.columns - left + border]
+    np.testing.assert_allclose(found, gain, rtol=0.01)
 
 
 def test_an_offset_is_a_plane_whatever_some_elements_show():
@@ -84,7 +86,7 @@ def test_the_corrected_difference_is_that_of_the_naive_one(pixels):
     f, level, before = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
     scales, offset = random.uniform(0.2, 2, pixels.bounds[2:]).astype(np.float32), np.array([3.0, 0.1, -0.2])
     difference = before.copy()
-    correct_brightness(pixels.lines, f, 1 / level, scales, offset, difference)
+    correct_brightness(pixels.lines, f, 1 / level, scales, 0, offset, difference)
     top, left = pixels.bounds[:2]
     rows, columns = pixels.rows - top, pixels.columns - left
     a, b = scales[rows, columns], offset[0] + offset[1] * columns + offset[2] * rows
