@@ -1,4 +1,4 @@
-"""Least squares with Cauchy weights, many small fits at once (Holland and Welsch, Commun. Stat. A6, 1977)."""
+"""Least squares with Cauchy weights, many small fits at once (Holland and Welsch 1977)."""
 
 from __future__ import annotations
 
