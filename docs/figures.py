@@ -157,7 +157,9 @@ class Demo:
         calibration = Calibration.read(folder / "test" / "calibration.json")
         files = sorted((folder / "test" / "frames").glob("*.dng"))
         self.raw = read_frame(files[-1])
-        self.before, self.after = (separate(read_frame(file), calibration).values for file in (files[0], files[-1]))
+        self.before, self.after = (
+            separate(read_frame(file), calibration).on_first_light().values for file in (files[0], files[-1])
+        )
         self.result = Result.open(folder / "result")
         options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size, "normalise": 10.0}
         self.alone = correlate(self.before[0], self.after[0], **options)
