@@ -176,8 +176,18 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
 
 def fail(message: str, status: int = FAILURE) -> int:
     """Print an error as one line and return the status."""
-    print(f"error: {shorten(' '.join(message.split()))}", file=sys.stderr)
+    print(f"error: {shorten(' '.join(name_options(message).split()))}", file=sys.stderr)
     return status
+
+
+_ARGUMENT = re.compile("`([a-z_]+)(=True)?`")
+_OPTIONS = {"point_pairs": "points", "points": "point", "scale": "test"}
+"""Options that have another name than the argument that they state."""
+
+
+def name_options(message: str) -> str:
+    """Replace the arguments of functions that a message of the library names, such as `overwrite=True`, by options."""
+    return _ARGUMENT.sub(lambda match: f"--{_OPTIONS.get(match[1], match[1]).replace('_', '-')}", message)
 
 
 def print_help_without_command(context: typer.Context) -> None:

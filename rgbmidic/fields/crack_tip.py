@@ -117,7 +117,7 @@ class Williams:
         if self.units.mm_per_pixel is None:
             raise InputError(
                 "stress intensity factors, in MPa √m, need the scale of the image: state mm_per_pixel or camera in "
-                "[scale] (`rgbmidic scale` finds the former), and no lengths in px (--px, scale.unit)"
+                "[scale] (`rgbmidic scale` finds the former), and no lengths in px (scale.unit)"
             )
 
     @property

@@ -131,7 +131,7 @@ class CameraCalibration:
         """Parameters (16,) of the map, in the order of `covariance`."""
         lens = np.r_[1.0, self.centre, np.zeros(5)] if self.lens is None else self.lens
         if self.homography is None:
-            raise InputError(f"{self.name} holds no plane: calibrate with --plane, a photograph of the target on it")
+            raise InputError(f"{self.name} holds no plane: photograph the target on it (`rgbmidic-calibrate camera`)")
         return np.asarray(np.r_[lens, self.homography.ravel()[:8]])
 
     def to_mm(self, points: FloatArray, parameters: FloatArray | None = None) -> FloatArray:

@@ -153,8 +153,7 @@ _ADVICE = (
     ),
     (
         (".raw", ".bin"),
-        "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or --shape and "
-        "--dtype)",
+        "a file without a camera's header: state its `shape` and `dtype` (frames.shape and frames.dtype)",
     ),
 )
 """By endings, what files are that are no frames, and what to do."""

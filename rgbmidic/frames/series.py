@@ -504,7 +504,7 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
     if path.suffix.lower() not in TIFF_ENDINGS:
         raise InputError(f"a frame is saved as .tif, not as {path}")
     if path.exists() and not overwrite:
-        raise InputError(f"{path} exists already; --overwrite replaces it")
+        raise InputError(f"{path} exists already; `overwrite=True` replaces it")
     if not path.parent.is_dir():
         raise InputError(f"there is no folder {path.parent} to save {path.name} in")
     write_tiff(path, series.read(index)[0])

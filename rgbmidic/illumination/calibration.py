@@ -363,7 +363,7 @@ class TargetLights:
             if self.crop_origin is None and full_shape is not None and shape != full_shape:
                 raise CalibrationError(
                     f"{self.calibration.name} was made with frames of {_size(full_shape)} px, the photograph has "
-                    f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
+                    f"{_size(shape)} px: state `crop_origin`, where it begins in the calibrated frame"
                 )
             registration = self.calibration.cropped(self.crop_origin, shape).registration
         elif self.crop_origin is not None and registration is not None:

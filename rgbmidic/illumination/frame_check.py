@@ -128,7 +128,7 @@ def check_state(
         raise FrameError(
             f"{name} is not what was calibrated: {'; '.join(check.text for check in wrong)}. Take the calibration of "
             "this camera and these lights; if all this is meant to be, accept it: calibration.accept = "
-            f"[{names}] (rgbmidic inspect: --accept)"
+            f"[{names}] (`rgbmidic inspect --accept`)"
         )
     return checks
 

@@ -151,7 +151,7 @@ def run_demo(
 
     test, scene = out / "test", out / "scene.toml"
     if out.exists() and any(out.iterdir()):
-        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder (--out)")
+        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder (`out`)")
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")

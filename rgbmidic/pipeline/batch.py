@@ -216,7 +216,7 @@ def _measured(
     except AnotherTestError as error:
         reason = str(error).rpartition("; ")[0]
         if not overwrite:
-            raise ResultError(f"{reason}; --overwrite measures it again") from None
+            raise ResultError(f"{reason}; `overwrite=True` measures it again") from None
         logger.warning("%s is measured again: %s", folder.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
     return result, settings, has_run

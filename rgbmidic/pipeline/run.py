@@ -113,7 +113,7 @@ def measure(
         or `out` contains the result of another test.
     """
     if retry_failed and not resume:
-        raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
+        raise InputError("`retry_failed` goes with `resume`: it measures failed frames of a result again")
     if isinstance(settings, str | Path):
         settings = read_test(settings)
     check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
@@ -304,8 +304,7 @@ def _select_positions(selected: range, frames: range | None) -> range:
     positions = [position for position, index in enumerate(selected) if frames is None or index in frames]
     if frames is not None and (not positions or frames.stop > selected[-1] + 1):
         raise FrameError(
-            f"--frames names {frames.start} to {frames.stop - 1}; the test has the frames {selected[0]} to "
-            f"{selected[-1]}"
+            f"`frames` are {frames.start} to {frames.stop - 1}; the test has the frames {selected[0]} to {selected[-1]}"
         )
     return range(positions[0], positions[-1] + 1)
 

@@ -235,7 +235,7 @@ class Channels:
         if not ((times >= start) & (times <= end)).any():
             raise InputError(
                 f"the channels {self.path} span {start:.9g} to {end:.9g} s (offset {self.offset:g} s included), the "
-                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (--offset) between "
+                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (`offset`) between "
                 "both clocks"
             )
         return {name: np.interp(times, self.times, values, np.nan, np.nan) for name, values in self.values.items()}

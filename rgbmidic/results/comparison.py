@@ -473,7 +473,7 @@ def _match_times(
     """Find the time (T,) of each frame, the frames to compare, and those beyond the simulation's times."""
     for index in requested or ():
         if result.frame(index).status == FAILED:
-            raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
+            raise InputError(f"frame {index} of {result.path} is not measured; compare another one (`frames`)")
         if index not in result.deformed:
             raise InputError(f"frame {index} of {result.path} is of the reference, against which nothing has moved")
     measured_frames = [index for index in result.deformed if result.finished[index] and result.status[index] != FAILED]
@@ -496,7 +496,7 @@ def _match_times(
             subject = f"frame {frames_outside[0]} is at {clock[frames_outside[0]]:.9g}"
         raise InputError(
             f"{subject} {unit}, the simulation {simulation.name} spans {start:.9g} to {end:.9g}: state the "
-            "--offset between both clocks, or other --frames"
+            "`offset` between both clocks, or other `frames`"
         )
     return np.clip(clock, start, end), tuple(frames_inside), frames_outside
 

@@ -185,7 +185,7 @@ def read_histories(
     ['point_1_u', 'point_1_v']
     """
     if not probes.kind_coordinates and probes.rigid_motion == "none":
-        raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
+        raise InputError("no probe is stated, such as a point (`points`, or [probes] of TEST.toml)")
     physical = ResultInUnits.without_times(result, scale)
     base = empty_histories(result, physical)
     rectified, frames, units = replace(physical.rectified, units=base.units), base.frames, base.units

@@ -286,7 +286,8 @@ _TABLE = (
     ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     ResultQuantity("warnings", ("warning",), "", "", "what is doubtful about it, a text each", **_TEXT),
     ResultQuantity("unread", (), "", "",
-        "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
+        "1 if the frame failed because it could not be read (`rgbmidic run --resume` tries again), else 0",
+        dtype=np.int64, blank=0),
     ResultQuantity("tries", (), "", "",
         "2 for a key frame that was also measured from the frame just before it, else 1", dtype=np.int64, blank=1),
     ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
@@ -323,7 +324,7 @@ _TABLE = (
         "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
         "without `frames.update_reference`"),
     ResultQuantity("best_match", (), "", "",
-        "largest `match` of the frames compared with the same reference, up to this one", blank=0),
+        "largest match of the frames compared with the same reference, up to this one", blank=0),
     ResultQuantity("reference_updates", ("reference_update",), "", "",
         "indices in the result of the frames that became the reference, up to this one: this frame was compared with "
         "the last one before it, or with the test's reference", dtype=np.int64, blank=0),
@@ -343,7 +344,7 @@ _TABLE = (
         "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
         "a light that sees nothing"),
     ResultQuantity("seconds", (len(STAGES),), "s", "",
-        f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
+        f"time of each of the stages {', '.join(STAGES)}; NaN without `rgbmidic run --timings`"),
     ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
     ResultQuantity("reflection_thumbnail", _PICTURE, "", "",
         "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it",

@@ -188,7 +188,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         if "finished" in self.provenance or self.table.damaged.any():
             raise ResultError(
                 f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-                "--resume` measures them again, --partial (partial=True) reads the rest"
+                "--resume` measures them again, `partial=True` reads the rest"
             )
         raise ResultError(
             f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"

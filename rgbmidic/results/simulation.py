@@ -103,12 +103,12 @@ class Simulation:
         path = Path(path)
         table = path.suffix.lower() == ".csv"
         if interval is not None and not path.is_dir():
-            raise InputError(f"--interval is the time between the files of a folder, and {path} is none")
+            raise InputError(f"`interval` is the time between the files of a folder, and {path} is none")
         if field is not None and table:
-            raise InputError(f"--field names a field of a mesh file; the columns of {path} have names of their own")
+            raise InputError(f"`field` names a field of a mesh file; the columns of {path} have names of their own")
         if table:
             if mesh is None:
-                raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
+                raise InputError(f"{path} has numbers of nodes only: state the `mesh` that they belong to")
             values, times = _read_table(path, mesh, unit)
         else:
             clock, files = zip(*_list_states(path, interval), strict=True)
@@ -124,7 +124,7 @@ class Simulation:
             raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
         if offset and (times is None or len(times) == 1):
             raise InputError(
-                f"--offset shifts the times of several states; {path} is one, and is compared with every frame"
+                f"`offset` shifts the times of several states; {path} is one, and is compared with every frame"
             )
         return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
 
@@ -167,7 +167,7 @@ def _list_numbered_states(path: Path, interval: float | None) -> list[tuple[floa
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:
         raise InputError(
-            f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
+            f"the times of the files in {path} are not known: state `interval`, the time between two numbers (above 0)"
         )
     return sorted(
         (interval * float(numbers[-1]), file) for numbers, file in zip(files.numbers, files.paths, strict=True)
@@ -182,7 +182,7 @@ def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
     if values is None or values.ndim != 2 or values.shape[1] <= max(mesh.axes):
         available = ", ".join(f"{name} {entry.shape[1:]}" for name, entry in mesh.fields.items()) or "none"
         requested = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
-        raise InputError(f"{mesh.name} has no nodal vector {requested} (--field); its nodal data: {available}")
+        raise InputError(f"{mesh.name} has no nodal vector {requested} (`field`); its nodal data: {available}")
     return np.asarray(values[:, mesh.axes], dtype=np.float64) * mesh.unit_mm
 
 
@@ -252,13 +252,13 @@ def find_placement(
     InputError
         No points are known, or they place no mesh.
     """
-    points, source = point_pairs, "--points"
+    points, source = point_pairs, "`point_pairs`"
     if not points and (stored_placement := placement_of(result)) is not None:
         points, source = stored_placement.pairs.tolist(), "mesh.points"
     if not points:
         raise InputError(
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
-            "--points X_MM,Y_MM:X_PX,Y_PX each"
+            "each in mm and in px (`point_pairs`)"
         )
     placement = Placement.fit(points, rectification_of(result, scale, "mm").camera, label=source)
     mm_per_pixel = (

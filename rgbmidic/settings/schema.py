@@ -159,7 +159,7 @@ class ProbeSettings(CheckedSettings):
         if self.tips and missing:
             yield (
                 'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
-                f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}'
+                f'"strain"); missing: {", ".join(missing)}'
             )
         if self.terms == 1:
             yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"

@@ -116,7 +116,7 @@ def start_server(path: Path, *, port: int = 0, statement: Mapping[str, Any] | No
         sockets, port = bind_sockets(_HOST, port)
     except OSError as error:
         raise InputError(
-            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
+            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another `port`, or none"
         ) from None
     application = _Application(
         {route: _Site(FunctionHandler(page)) for route, page in pages.items()},
