@@ -123,6 +123,7 @@ def main(app: typer.Typer) -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
     handler.addFilter(OnceFilter())
+    handler.setFormatter(OptionFormatter())
     loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
     for logger in loggers:  # not the root: other libraries talk to programmers
         logger.addHandler(handler)
@@ -130,6 +131,14 @@ def main(app: typer.Typer) -> None:
     for logger in loggers:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+class OptionFormatter(logging.Formatter):
+    """A formatter that reports the arguments that a message of the library names as options."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the text of a record."""
+        return name_options(super().format(record))
 
 
 class OnceFilter(logging.Filter):

@@ -63,6 +63,11 @@ class Deformed:
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     origin : tuple of int
         Column and row of the frame at which the images begin.
+
+    Examples
+    --------
+    >>> Deformed.prepare(np.ones((3, 40, 60), dtype=np.float32)).weights.shape
+    (3, 40, 60)
     """
 
     coefficients: FloatImage
@@ -190,6 +195,15 @@ class Reference:
         One of `PREFILTERS`.
     constants : SolverConstants
         Of the solve.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> reference.pixels.shape
+    (40, 60)
     """
 
     mesh: Tri3Mesh

@@ -42,6 +42,16 @@ class Residual:
         f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> residual = Residual.at(reference, Deformed.prepare(images), [np.zeros_like(reference.mesh.nodes)])
+    >>> bool(np.abs(residual.difference).max() < 1e-4)  # both states are the same
+    True
     """
 
     reference: Reference
@@ -137,6 +147,11 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+
+    Examples
+    --------
+    >>> Precision(factor=np.ones((3, 100), np.float32), loss_curvature=np.ones(100, np.float32)).factor.shape
+    (3, 100)
     """
 
     factor: FloatImage
@@ -164,7 +179,16 @@ class Precision:
 
 
 class PrecisionMethod(Protocol):
-    """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own."""
+    """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own.
+
+    Examples
+    --------
+    >>> class EqualLights:
+    ...     def precision(self, residual: Residual) -> Precision:
+    ...         factor = np.ones_like(residual.weights)
+    ...         return Precision(factor=factor, loss_curvature=factor[0])
+    >>> method: PrecisionMethod = EqualLights()
+    """
 
     def precision(self, residual: Residual) -> Precision | None:
         """Precision of the lights for the next pass; None leaves the weights as they are given.

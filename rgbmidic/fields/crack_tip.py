@@ -93,6 +93,12 @@ class Williams:
         Highest term N of the series; 0: the least one that a chi-square test accepts in all frames.
     fit_tip
         Whether the tip's place along the crack is fitted in every frame; else it is that of the mesh.
+
+    Examples
+    --------
+    >>> steel = Williams(youngs_modulus=210e3, poissons_ratio=0.3, plane="stress", units=Units(mm_per_pixel=0.05))
+    >>> round(steel.kolosov, 3)
+    2.077
     """
 
     youngs_modulus: float

@@ -96,6 +96,13 @@ class CameraCalibration:
         Other content of the file: residuals, views, tilt, provenance.
     name : str
         File name, for messages.
+
+    Examples
+    --------
+    >>> camera = CameraCalibration(shape=(400, 600), homography=np.diag([0.05, 0.05, 1.0]))
+    >>> scale, std = camera.scale(np.array([300.0, 200.0]))
+    >>> round(scale, 6), std
+    (0.05, 0.0)
     """
 
     shape: tuple[int, int]
@@ -520,6 +527,13 @@ class Rectification:
     units
         With the millimetres for a rectified px, or for a px where a scale is stated in place of a camera. Chosen such
         that the median element of both meshes has one size.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> Rectification(camera=None, image=mesh, mesh=mesh, units=Units()).probe_coordinates((40.0, 30.0), 1)
+    (40.0, 30.0)
     """
 
     camera: CameraCalibration | None

@@ -72,6 +72,14 @@ class Calibration:
         Inputs with their hashes, date, software version, by section; not changed by reading.
     extra
         Sections of the file that this class does not interpret, kept when the file is written again.
+
+    Examples
+    --------
+    >>> calibration = Calibration.read("calibration.json")
+    >>> calibration.crosstalk.lights, calibration.kind
+    (('red', 'green', 'blue'), 'bayer')
+    >>> calibration.crosstalk.matrix.shape
+    (3, 3)
     """
 
     crosstalk: Crosstalk | None = None

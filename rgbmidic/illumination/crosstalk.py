@@ -492,6 +492,13 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     ------
     InputError
         The channels do not fit the crosstalk matrix.
+
+    Examples
+    --------
+    >>> channels = LinearChannels(values=np.full((3, 4, 5), 110.0), valid=np.full((3, 4, 5), True), full_scale=4095.0)
+    >>> crosstalk = Crosstalk(matrix=1.1 * np.eye(3), lights=("red", "green", "blue"))
+    >>> unmix(channels, crosstalk).values[:, 0, 0].round(3)
+    array([100., 100., 100.], dtype=float32)
     """
     colours = crosstalk.matrix.shape[0]
     if channels.values.ndim != 3 or len(channels.values) != colours or channels.valid.shape != channels.values.shape:

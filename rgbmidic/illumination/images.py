@@ -236,6 +236,13 @@ class IlluminationImages:
         Column and row of the frame at which the images begin.
     registration : Registration or None
         Where in its own image a light shows what the first one shows at a pixel of the frame; None: at the same pixel.
+
+    Examples
+    --------
+    >>> values = np.full((2, 4, 5), 100.0)
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red", "blue"), full_scale=255.0)
+    >>> images.shape, images.valid.all()
+    ((4, 5), np.True_)
     """
 
     values: FloatImage

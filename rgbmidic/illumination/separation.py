@@ -144,6 +144,12 @@ def demosaic(
     ------
     InputError
         Unknown method, or a frame too small for it.
+
+    Examples
+    --------
+    >>> mosaic = Mosaic(values=np.full((16, 20), 564, dtype=np.uint16), cfa="RGGB", black_level=64, white_level=4095)
+    >>> demosaic(mosaic, "malvar").values[:, 8, 8]
+    array([500., 500., 500.], dtype=float32)
     """
     linear = linearise(mosaic) if isinstance(mosaic, Mosaic) else mosaic
     if not isinstance(linear, LinearMosaic):
@@ -205,6 +211,16 @@ class LightSeparation(Protocol):
 
     - ``learnt(images)``: the separation of all other frames, which has the images of the reference's first frame;
     - ``describe()``: a text that says what it does; another text is another test, which `resume` refuses.
+
+    Examples
+    --------
+    >>> def first_channel(frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
+    ...     values = frames[0].values[:1].astype(float)
+    ...     return IlluminationImages(values=values, valid=values >= 0, names=("red",), full_scale=4095.0)
+    >>> separation: LightSeparation = first_channel
+    >>> frame = ChannelFrame(values=np.full((3, 4, 5), 9, dtype=np.uint16), black_level=np.zeros(3), white_level=4095.0)
+    >>> separation((frame,)).values.shape
+    (1, 4, 5)
     """
 
     def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...], /) -> IlluminationImages:
@@ -248,6 +264,12 @@ class Separation:
         The speckle's autocorrelation, shared by all frames of a test; None: each frame tells its own.
     tables
         The filters that its frames have needed so far.
+
+    Examples
+    --------
+    >>> frame = ChannelFrame(values=np.full((1, 4, 5), 9, dtype=np.uint16), black_level=np.ones(1), white_level=4095.0)
+    >>> Separation()((frame,)).values[0, 0, 0]
+    np.float32(8.0)
     """
 
     calibration: Calibration | None = None

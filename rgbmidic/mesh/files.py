@@ -75,6 +75,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     >>> mesh = read_mesh("plate.inp")
     >>> mesh.element_numbers.tolist(), mesh.areas.tolist()
     ([7], [50.0])
+    >>> Path("plate.inp").unlink()
     """
     path = Path(path)
     if unit not in LENGTH_UNITS:

@@ -129,6 +129,16 @@ class Plan:
         Whether to tell the time that each stage of a frame takes.
     process
         What the threads of a process share.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(2, 80, 80)), (0, 1.5, 1.5))
+    >>> frames, region = {"path": [], "kind": "monochrome"}, {"rectangle": [0, 0, 79, 79]}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": region})
+    >>> plan = Plan.from_settings(settings, source=speckle)
+    >>> plan.images.shape, plan.reference.mesh.nodes.shape[1]
+    ((80, 80), 2)
     """
 
     settings: TestSettings

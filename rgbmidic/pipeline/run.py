@@ -111,6 +111,21 @@ def measure(
     RgbmidicError
         The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
         or `out` contains the result of another test.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> stack = np.stack([np.roll(speckle, frame, axis=1) for frame in range(2)])
+    >>> frames, region = {"path": [], "kind": "monochrome"}, {"rectangle": [0, 0, 79, 79]}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": region, "mesh": {"element_size": 40}})
+    >>> with TemporaryDirectory() as folder:
+    ...     result = measure(settings, Path(folder) / "result", source=stack, workers=1)
+    ...     round(float(np.nanmedian(result.u[1])), 2)
+    1.0
     """
     if retry_failed and not resume:
         raise InputError("`retry_failed` goes with `resume`: it measures failed frames of a result again")

@@ -244,6 +244,15 @@ def measure_sequence(
     ------
     RgbmidicError
         The settings contradict themselves or the objects, or the reference is not usable.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> states = (np.roll(speckle, frame, axis=1) for frame in range(3))
+    >>> solutions = measure_sequence(states, element_size=40)
+    >>> [round(float(np.nanmedian(solution.displacement[:, 0])), 2) for solution in solutions]
+    [0.0, 1.0, 2.0]
     """
     check_type("settings", settings, TestSettings | None, "a TestSettings")
     if not np.iterable(states):

@@ -44,6 +44,14 @@ class Channels:
         Name of each channel to its values (n,).
     offset
         Seconds that were added to the recorded times to make them those of the frames.
+
+    Examples
+    --------
+    >>> np.savetxt("force.csv", [[0, 0], [0.1, 20]], delimiter=",", header="time_s,force_N", comments="")
+    >>> channels = Channels.read("force.csv", offset=0.1)
+    >>> channels.interpolate(np.array([0.15]))
+    {'force_N': array([10.])}
+    >>> Path("force.csv").unlink()
     """
 
     path: Path

@@ -184,6 +184,22 @@ class Comparison:
     InputError
         The simulation covers none of the measurement, or none of its times; a frame that is asked for is not measured
         or beyond its times.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import FiniteElementMesh
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 8], [0, 8]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> simulation = Simulation(mesh=mesh, displacement=np.zeros((1, 4, 2)))
+    >>> placement = Placement.fit([(0, 0, 80, 240), (10, 0, 240, 240)])
+    >>> comparison = Comparison(Result.open("my_result"), simulation, placement, frames=[1])
+    >>> comparison.frame(1).agreement["nodes", "displacement"].values > 0
+    True
     """
 
     def __init__(
@@ -453,7 +469,13 @@ class Comparison:
 
 
 def measured_mesh(result: Result) -> FiniteElementMesh | None:
-    """Return the part of ``mesh.file`` that a result was measured on; None where it has none."""
+    """Return the part of ``mesh.file`` that a result was measured on; None where it has none.
+
+    Examples
+    --------
+    >>> measured_mesh(Result.open("my_result")) is None  # its mesh is of no file
+    True
+    """
     if result.node_number is None or result.element_number is None or result.node_mm is None:
         return None
     document = result.provenance["finite_elements"]

@@ -63,6 +63,12 @@ class MapValues:
         Deformed places of the nodes, px of the image; NaN where not measured.
     status : ndarray, shape (N,), uint8
         `node_status`.
+
+    Examples
+    --------
+    >>> exx = Maps.from_result(Result.open("my_result")).read("exx", 1)
+    >>> exx.values.shape == exx.std.shape == exx.status.shape
+    True
     """
 
     values: FloatArray

@@ -66,6 +66,12 @@ class Origin:
         Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
     notes
         Further plain values to keep in the provenance, such as ``frame_rate`` and ``exposure_ns``.
+
+    Examples
+    --------
+    >>> origin = Origin(nodes=[[0, 0], [9, 0], [0, 9]], elements=[[0, 1, 2]], names=["a.png"], lights=["red"])
+    >>> origin.references
+    (0,)
     """
 
     nodes: npt.ArrayLike

@@ -435,6 +435,12 @@ def finish_result(path: Path | str, warnings: Sequence[str] = ()) -> None:
     ------
     ResultError
         The folder is no result, a frame is missing or damaged, or it cannot be written.
+
+    Examples
+    --------
+    >>> finish_result("my_result")
+    >>> "finished" in Result.open("my_result").provenance
+    True
     """
     result = Result.open(path, partial=True, check=False)
     result.without_damaged()._check_complete()

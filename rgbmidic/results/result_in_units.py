@@ -95,6 +95,11 @@ def placement_of(result: Result) -> Placement | None:
     Returns
     -------
     Placement or None
+
+    Examples
+    --------
+    >>> placement_of(Result.open("my_result")) is None  # its mesh is of no file
+    True
     """
     document = result.provenance.get("finite_elements")
     return None if document is None else Placement.from_document(document["placement"], _stored_camera(result))

@@ -57,6 +57,18 @@ class Simulation:
         In seconds (or in frames, where these have no times), rising; None for one state without a time.
     name : str
         The file or folder, for messages.
+
+    Examples
+    --------
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 8], [0, 8]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> Simulation(mesh=mesh, displacement=np.zeros((1, 4, 2))).interpolate(0.0).shape
+    (4, 2)
     """
 
     mesh: FiniteElementMesh
@@ -228,7 +240,13 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
 
 
 def label_indices(numbers: IntArray, labels: npt.NDArray[Any]) -> IntArray:
-    """Return the index of each label among some numbers; -1 where it is none of them."""
+    """Return the index of each label among some numbers; -1 where it is none of them.
+
+    Examples
+    --------
+    >>> label_indices(np.array([7, 3, 5]), np.array([5, 7, 4])).tolist()
+    [2, 0, -1]
+    """
     positions = {number: position for position, number in enumerate(numbers.tolist())}
     return np.array([positions.get(number, -1) for number in labels.tolist()], dtype=np.int64)
 
@@ -251,6 +269,12 @@ def find_placement(
     ------
     InputError
         No points are known, or they place no mesh.
+
+    Examples
+    --------
+    >>> placement = find_placement(Result.open("my_result"), point_pairs=[(0, 0, 40, 240), (10, 0, 240, 240)])
+    >>> round(placement.mm_per_pixel, 6)
+    0.05
     """
     points, source = point_pairs, "`point_pairs`"
     if not points and (stored_placement := placement_of(result)) is not None:

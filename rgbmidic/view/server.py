@@ -93,6 +93,14 @@ def serve(
         The folder is not a result, or is damaged.
     InputError
         The port is in use; or `statement` is not empty and `path` is something else than frames.
+
+    Examples
+    --------
+    >>> def stop(address):  # else it answers until Ctrl-C
+    ...     raise SystemExit
+    >>> serve(Path("my_result"), browser=False, report_address=stop)
+    Traceback (most recent call last):
+    SystemExit
     """
     for library in ("bokeh", "tornado"):  # their messages on a malformed request are for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)

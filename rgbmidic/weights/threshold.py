@@ -75,6 +75,14 @@ def threshold_weights(images: IlluminationImages, *, threshold: float = FALLBACK
     -------
     ndarray, shape (k, H, W), float32
         Invalid (saturated) pixels count as full scale in the blur and have weight 0.
+
+    Examples
+    --------
+    >>> values = np.full((1, 40, 60), 100.0)
+    >>> values[:, :, 40:] = 900
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=1000.0)
+    >>> threshold_weights(images, blur=2.0)[0, 20, [0, 59]].tolist()
+    [1.0, 0.0]
     """
     bright = blurred(images, blur) > threshold * images.full_scale
     return (images.valid & ~bright).astype(np.float32)
@@ -93,6 +101,13 @@ def blurred(images: IlluminationImages, blur: float) -> FloatImage:
     Returns
     -------
     ndarray, shape (k, H, W), float32
+
+    Examples
+    --------
+    >>> values = np.full((1, 40, 60), 100.0)
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=1000.0)
+    >>> blurred(images, 2.0)[0, 20, 30].round(3)
+    np.float32(100.0)
     """
     filled = np.where(images.valid, images.values, np.float32(images.full_scale))
     return np.stack([cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101) for image in filled])
