@@ -349,7 +349,8 @@ class Reference:
         """
         gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
         if self.brightness != "none":
-            gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+            centres = self.mesh.centres - self.pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, self.constants.min_gain_correlation)
         has_gain = np.isfinite(gain)
         fits: list[GainFit | None] = [None] * len(weights)
         for light, fit in enumerate(self.gain_fits):

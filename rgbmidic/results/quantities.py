@@ -338,8 +338,8 @@ _TABLE = (
     ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction",
         "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
     ResultQuantity("brightness", ("light", 2), "", "",
-        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians "
-        "over the elements; reported, not used"),
+        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle; "
+        "reported, not used"),
     ResultQuantity("rigid", ("light", "function"), "", "rigid",
         "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
         "a light that sees nothing"),
