@@ -7,7 +7,7 @@ import math
 import operator
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePath
@@ -361,6 +361,13 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, int | float) else []
 
 
+def convert_fields(instance: object, convert: Callable[[Field[Any], Any, Any], Any]) -> None:
+    """Replace each field of a frozen dataclass by what `convert` makes of the field, its value and its annotation."""
+    hints = type_hints(cast(Any, type(instance)))
+    for entry in fields(cast(Any, instance)):
+        object.__setattr__(instance, entry.name, convert(entry, getattr(instance, entry.name), hints[entry.name]))
+
+
 class CheckedSettings:
     """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
 
@@ -368,11 +375,10 @@ class CheckedSettings:
     section = ""
 
     def __post_init__(self) -> None:
-        hints = type_hints(cast(Any, self.__class__))
-        for entry in fields(cast(Any, self)):
-            key = f"{self.section}.{entry.name}".lstrip(".")
-            value = convert_field(entry, getattr(self, entry.name), hints[entry.name], key)
-            object.__setattr__(self, entry.name, value)
+        convert_fields(
+            self,
+            lambda entry, value, hint: convert_field(entry, value, hint, f"{self.section}.{entry.name}".lstrip(".")),
+        )
         for problem in self._problems():
             raise ConfigurationError(problem)
 
