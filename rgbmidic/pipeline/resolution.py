@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,16 +26,13 @@ from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
 
 SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)
 """Element sizes (px) that are tried where none are stated: the default (the paper's) and steps of 1.6, which change the
 noise by as much and the discretisation error of a smooth field by 4 (its third power)."""
-
-
-Progress = Callable[[int, int, str], None]
 
 
 def sizes_to_try(plan: Plan, requested: Sequence[float] = ()) -> tuple[float, ...]:
@@ -74,7 +71,7 @@ def study_sizes(
     gauges: Sequence[float] | None = None,
     frames: Sequence[int] = (),
     static: bool = True,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     **objects: Any,
 ) -> ResolutionStudy:
     """Measure a deformed frame and the static frames of a test with elements of several sizes.
