@@ -302,7 +302,6 @@ class Reference:
         if brightness == "auto":
             sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
-        weighted *= level > DARK * level.max(axis=1, keepdims=True)
         inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
         for light, fit in enumerate(fits):
             for axis in light_gradient[:, light]:
