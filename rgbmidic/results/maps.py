@@ -22,7 +22,8 @@ from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, st
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, ResultQuantity, map_quantities
+from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, map_quantities
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.results.result_in_units import (
     DISPLACEMENT_QUANTITIES,
