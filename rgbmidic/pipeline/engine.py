@@ -23,7 +23,8 @@ from rgbmidic.correlation import NodeStatus, Status, TrackingState
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
-from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
+from rgbmidic.pipeline.order import STRIDE, is_key, parent
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.warnings import collect_messages
 

@@ -41,7 +41,8 @@ from rgbmidic.pipeline.frame_quality import (
     too_small,
     unsteady,
 )
-from rgbmidic.pipeline.plan import STRIDE, Plan, parent
+from rgbmidic.pipeline.order import STRIDE, parent
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage

@@ -20,8 +20,10 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
-from rgbmidic.pipeline.plan import Plan, dependants
-from rgbmidic.pipeline.resolution import choose, refine
+from rgbmidic.pipeline.order import dependants
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.refinement import refine
+from rgbmidic.pipeline.resolution import choose
 from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.user_objects import check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore

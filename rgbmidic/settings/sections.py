@@ -179,7 +179,7 @@ class MeshSettings(CheckedSettings):
         frames (``"key"``): every 16th and the last.
     refine
         Whether elements are bisected where the discretisation error of strain is more than twice its noise
-        (`rgbmidic.pipeline.resolution.refine`), in the frame of this index, or in a key frame (True).
+        (`rgbmidic.pipeline.refinement.refine`), in the frame of this index, or in a key frame (True).
 
     Examples
     --------

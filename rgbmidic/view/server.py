@@ -35,11 +35,11 @@ from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import FrameProgress
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, Run
 from rgbmidic.view.test_file_editor import Draft
+from rgbmidic.view.time_line import FrameProgress
 from rgbmidic.view.url_state import ViewState
 from rgbmidic.view.widgets import page_file
 
