@@ -17,9 +17,10 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
-from rgbmidic.illumination.frame_check import Frame, check_state
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
+from rgbmidic.illumination.plane_samples import Frame
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
