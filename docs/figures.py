@@ -159,7 +159,7 @@ class Demo:
         self.raw = read_frame(files[-1])
         self.before, self.after = (separate(read_frame(file), calibration).values for file in (files[0], files[-1]))
         self.result = Result.open(folder / "result")
-        options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size, "normalise": 10.0}
+        options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size}
         self.alone = correlate(self.before[0], self.after[0], **options)
         with np.load(folder / "test" / "truth.npz") as archive:
             self.truth = archive["displacement"][-1]
@@ -182,7 +182,7 @@ def droplets() -> tuple[Any, Any, list[Any]]:
     clean = [bench.render(angle) for angle in (0.0, 8.0)]
     gain = bench.exposure_gain(max(bench.brightest(images) for images in clean))
     f, g = (bench.photograph(images * gain, shot, "auto").values for shot, images in enumerate(clean))
-    solutions = [correlate(f[lights], g[lights], region=bench.region, normalise=10.0) for lights in ([1], slice(None))]
+    solutions = [correlate(f[lights], g[lights], region=bench.region) for lights in ([1], slice(None))]
     return g[1], bench.truth(8.0), solutions
 
 
