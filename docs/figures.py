@@ -229,7 +229,7 @@ def match(theme: str, demo: Demo) -> None:
     ink, faint, _ = THEMES[theme]
     rows, columns = np.mgrid[:448, :448].astype(float)
     places = rows + demo.truth[1], columns + demo.truth[0]
-    # divided by their local mean, as the solve does (sigma 10 px)
+    # divided by their local mean (sigma 10 px), which takes out shading
     before, after = (images / gaussian_filter(images, (0, 10, 10)) for images in (demo.before, demo.after))
     warped = np.stack([map_coordinates(image, places, order=3, mode="nearest") for image in after])
     # where red errs most against blue, over the stretch that is drawn
