@@ -176,14 +176,15 @@ def droplets() -> tuple[Any, Any, list[Any]]:
     """The bench with raised droplets turned by 8 degrees: green's image, truth, solutions by green alone and by all."""
     sys.path.append(str(ROOT / "examples" / "paper"))
     from bench import Bench
-    from rgbmidic import correlate
+    from rgbmidic import correlate, measure_sequence
 
     bench = Bench.build("bayer", 640)
     clean = [bench.render(angle) for angle in (0.0, 8.0)]
     gain = bench.exposure_gain(max(bench.brightest(images) for images in clean))
-    f, g = (bench.photograph(images * gain, shot, "auto").values for shot, images in enumerate(clean))
-    solutions = [correlate(f[lights], g[lights], region=bench.region) for lights in ([1], slice(None))]
-    return g[1], bench.truth(8.0), solutions
+    first, second = (bench.photograph(images * gain, shot, "auto") for shot, images in enumerate(clean))
+    alone = correlate(first.values[1], second.values[1], region=bench.region)
+    (together,) = measure_sequence([second], reference=first, region=bench.region)  # with the lights' registration
+    return second.values[1], bench.truth(8.0), [alone, together]
 
 
 def reflection(theme: str, demo: Demo) -> None:
