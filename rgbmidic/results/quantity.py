@@ -57,6 +57,7 @@ class ResultQuantity:
 
     Examples
     --------
+    >>> from rgbmidic.results import QUANTITIES
     >>> QUANTITIES["u_std"].unit, QUANTITIES["status"].codes
     ('px', ('converged', 'not converged', 'failed'))
     """
