@@ -14,7 +14,6 @@ from bench import Bench
 from measurement import SceneStudy
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.images import local_mean
 from rgbmidic.typing import AnyArray, FloatArray
 from run import run_scene
@@ -124,7 +123,7 @@ def with_peers(quick: bool) -> Iterator[Row]:
 
 def seen(images: IlluminationImages) -> FloatArray:
     """8-bit pictures (4, H, W) of the lights on the first one's grid and of their mean, over their local mean."""
-    lights = np.stack([image / local_mean(image, 10.0) for image in align(images).values])
+    lights = np.stack([image / local_mean(image, 10.0) for image in images.on_first_light().values])
     every = np.concatenate([lights, lights.mean(axis=0, keepdims=True)])
     return np.asarray(np.nan_to_num(every * 110, nan=110.0).clip(0, 255).round(), dtype=np.float64)
 
