@@ -129,7 +129,7 @@ def quoted_names(tree: ast.AST) -> Iterator[str]:
 def identifiers() -> frozenset[str]:
     """Names that the code has: bound, looked up, imported, keys in quotes, and modules."""
     found = set[str]()
-    for path, tree in (module for modules in rooms().values() for module in modules):
+    for path, tree in (module for room in modules() for module in trees(room)):
         found |= {path.stem, path.parent.name}
         for node in ast.walk(tree):
             found.update(re.findall(r"\w+", str(getattr(node, "asname", None) or getattr(node, "name", ""))))
@@ -155,7 +155,7 @@ def is_defined(name: str) -> bool:
 
 @pytest.mark.parametrize("room", renamed_rooms())
 def test_names_that_docstrings_quote_exist(room: str) -> None:
-    quoted = [(name, path.name) for path, tree in rooms()[room] for name in quoted_names(tree)]
+    quoted = [(name, path.name) for path, tree in trees(room) for name in quoted_names(tree)]
     missing = [f"{file}: {name}" for name, file in quoted if not name.startswith(ELSEWHERE) and not is_defined(name)]
     assert not missing
 
