@@ -237,15 +237,15 @@ def _passes(
         equations = _equations(problem, weighting, estimate)
         pass_tolerance = max(tolerance, problem.constants.first_pass_tolerance) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
+        reference = problem.reference
+        if number == 0:
+            problem = replace(problem, reference=reference.filtered_as(estimate.displacement))
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            reference = with_consistent_gradient(weighting.residual, weighting.weights()).filtered_as(
-                estimate.displacement
-            )
-            if reference is not problem.reference:
-                same, problem = reference.values is problem.reference.values, replace(problem, reference=reference)
-                residual = replace(weighting.residual, reference=reference) if same else compare(problem, estimate)
-                weighting, equations = replace(weighting, residual=residual), None
+            problem = replace(problem, reference=with_consistent_gradient(weighting.residual, weighting.weights()))
+            if problem.reference is not reference:
+                weighting = replace(weighting, residual=replace(weighting.residual, reference=problem.reference))
+                equations = None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
