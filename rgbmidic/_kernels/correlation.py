@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rgbmidic._kernels.owned_pixels import correct_element, largest_element
 from rgbmidic._kernels.splines import PAD
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
@@ -368,20 +369,41 @@ def element_vector(start, stop, weight, values, first, second, local_x, local_y,
     (P,) float32.
     """
     for e in range(start, stop):
-        b00, b01, b02 = _shape_function(barycentric, e, 0)
-        b10, b11, b12 = _shape_function(barycentric, e, 1)
-        p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
-            l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
-            weighted = weight[i] * values[i]
-            p, q = weighted * first[i], weighted * second[i]
-            p0 += p * l0
-            p1 += p * l1
-            p2 += p
-            q0 += q * l0
-            q1 += q * l1
-            q2 += q
-        out[e, 0, 0], out[e, 0, 1] = p0, q0
-        out[e, 1, 0], out[e, 1, 1] = p1, q1
-        out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1
+        _project(weight, values[offsets[e] :], first, second, local_x, local_y, offsets, barycentric, e, out)
+
+
+@compiled("out", fastmath=FAST)
+def corrected_vector(
+    start, stop, weight, difference, first, second, reference, inverse_level, scales, side, offset, lines, run_offsets,
+    local_x, local_y, offsets, barycentric, out,
+):  # fmt: skip
+    """Do the same with a `difference` that is corrected as by `correct_brightness`, and stays as it is."""
+    values = np.empty(largest_element(offsets) + _LANES, dtype=np.float32)
+    brightness = reference, inverse_level, scales, side, offset
+    for e in range(start, stop):
+        correct_element(difference, *brightness, lines, run_offsets, offsets, e, values)
+        _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out)
+
+
+@helper(fastmath=FAST)
+def _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out):
+    """Project on the shape functions of element e, whose `values` these are."""
+    b00, b01, b02 = _shape_function(barycentric, e, 0)
+    b10, b11, b12 = _shape_function(barycentric, e, 1)
+    p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
+    begin = np.uint64(offsets[e])
+    for n in range(np.uint64(offsets[e + 1]) - begin):
+        i = begin + n
+        l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
+        l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
+        weighted = weight[i] * values[n]
+        p, q = weighted * first[i], weighted * second[i]
+        p0 += p * l0
+        p1 += p * l1
+        p2 += p
+        q0 += q * l0
+        q1 += q * l1
+        q2 += q
+    out[e, 0, 0], out[e, 0, 1] = p0, q0
+    out[e, 1, 0], out[e, 1, 1] = p1, q1
+    out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1

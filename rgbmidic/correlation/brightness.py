@@ -142,25 +142,28 @@ class Brightness:
     def inverse_gain(
         self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float
     ) -> tuple[FloatImage, int]:
-        """Return 1 / a of a light from its difference f - g (P,), and the width of the border around it.
+        """Return 1 / a of a light from its difference f - g (P,), for `correct_brightness`, and the side of its blocks.
 
-        It is that of the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so
-        that a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
+        It covers the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so that
+        a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
         """
         fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
         if fit is None:
-            return np.full(shape, 1 / gain, dtype=np.float32), 0
-        rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
-        x, y = (columns + 0.5) * fit.side - 0.5, (rows + 0.5) * fit.side - 0.5
-        plane = offset[0] + offset[1] * x + offset[2] * y
-        local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
-        grid, largest = 1 / np.maximum(local, np.float32(min_ratio * gain)), 1 / (min_ratio * gain)
+            side, grid = max(shape), np.full((1, 1), 1 / gain, dtype=np.float32)
+        else:
+            side = fit.side
+            rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
+            x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
+            plane = offset[0] + offset[1] * x + offset[2] * y
+            local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
+            grid = 1 / np.maximum(local, np.float32(min_ratio * gain))
         if min(grid.shape) > 1:  # linear beyond the centres of the outermost blocks, too
-            grid = np.clip(np.pad(grid, 1, mode="reflect", reflect_type="odd"), 0, largest, dtype=np.float32)
+            grid = np.pad(grid, 1, mode="reflect", reflect_type="odd")
+            grid = np.clip(grid, 0, 1 / (min_ratio * gain), dtype=np.float32)
         else:
             grid = np.pad(grid, 1, mode="edge")
-        size = grid.shape[1] * fit.side, grid.shape[0] * fit.side
-        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), fit.side
+        size = grid.shape[1] * side, grid.shape[0]
+        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), side
 
 
 _ELEMENTS = 300

@@ -17,7 +17,7 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import add_second_derivatives, correct_brightness, interpolate_nodal
+from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
@@ -346,8 +346,8 @@ class Reference:
                 fits[light] = fit if same else GainFit.over(f, w, self.pixels, fit.sigma)
         return Brightness(gain=np.where(has_gain, gain, 1.0), offset=offset, fits=tuple(fits))
 
-    def correct_brightness(self, brightness: Brightness, light: int, difference: FloatImage) -> None:
-        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
+    def brightness_fields(self, brightness: Brightness, light: int, difference: FloatImage) -> tuple[AnyArray | int, ...]:
+        """Return what makes a light's residual ``(f - (g - b) / a) / level`` of its difference f - g, for kernels.
 
         Parameters
         ----------
@@ -356,12 +356,16 @@ class Reference:
         light
             Index of the light.
         difference : ndarray, shape (P,), float32
-            Of the grey levels; becomes the residual.
+            Of the grey levels.
+
+        Returns
+        -------
+        tuple
+            See `rgbmidic._kernels.owned_pixels.correct_brightness`.
         """
         _, _, *shape = self.pixels.bounds
-        scales, border = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
-        fields = self.values[light], self.inverse_level[light], scales, border, brightness.offset[light]
-        correct_brightness(self.pixels.lines, *fields, difference)
+        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
+        return self.values[light], self.inverse_level[light], *scales, brightness.offset[light]
 
     @property
     def gain_window(self) -> float | None:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.owned_pixels import subtract_quadratic
+from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
@@ -75,7 +75,9 @@ class Residual:
             warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
         brightness = reference.brightness_of(weights, moments)
         for light, light_difference in enumerate(difference):
-            reference.correct_brightness(brightness, light, light_difference)
+            fields = reference.brightness_fields(brightness, light, light_difference)
+            pixels = reference.pixels
+            correct_brightness(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, light_difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
