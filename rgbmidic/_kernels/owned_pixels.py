@@ -114,17 +114,31 @@ def block_sums(start, stop, values, lines, run_offsets, side, out):
 
 
 @compiled("out", axis=1, fastmath=FAST)
-def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets, side, out):
-    """Sum fields (n, P) times one `weight` (P,) over blocks of `side` px: ``out`` (n, h, w)."""
+def weighted_block_sums(start, stop, values, weight, lines, run_offsets, side, out):
+    """Sum a field (P,) times a `weight` (P,), and the weight, over blocks of `side` px: ``out`` (2, h, w).
+
+    One of (1, h, w) receives the first sum only.
+    """
     out[:, start:stop] = 0
-    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
-    products = np.empty((len(values), largest_element(offsets)), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
     for e in range(run_offsets.size - 1):
-        first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        for n in range(len(values)):
-            for i in range(number):
-                products[n, i] = weight[first + i] * values[n, first + i]
-        _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+        block, low, high = np.int64(-1), np.int64(0), np.int64(0)
+        for q in range(run_offsets[e], run_offsets[e + 1]):
+            slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
+            if row < start * side or row >= stop * side:
+                continue
+            if row // side != block:
+                _flush(columns, low, high, side, block, out)
+                block, low, high = row // side, column, column
+            low, high = min(low, column), max(high, column + number)
+            at, to, filled = np.uint64(slot), np.uint64(column), np.uint32(_filled(number, values.size - slot))
+            for i in range(filled):
+                product = weight[at + i] * values[at + i]
+                columns[0, to + i] += product if np.int32(i) < np.int32(number) else _ZERO
+            if len(out) > 1:
+                for i in range(filled):
+                    columns[1, to + i] += weight[at + i] if np.int32(i) < np.int32(number) else _ZERO
+        _flush(columns, low, high, side, block, out)
 
 
 @compiled("offsets", fastmath=FAST)
@@ -152,7 +166,7 @@ def correct_element(
 ):  # fmt: skip
     """Write the corrected difference of an element into ``out``, which is longer by a vector."""
     constant, slope, down = np.float32(offset[0]), np.float32(offset[1]), np.float32(offset[2])
-    pace, last_column = _ONE / np.float32(side), scales.shape[1] - _LANES
+    pace = _ONE / np.float32(side)
     for q in range(run_offsets[e], run_offsets[e + 1]):
         slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], lines[q, 3] + side
         first, target, from_column = np.uint64(slot), np.uint64(slot - offsets[e]), np.uint64(column)
@@ -160,11 +174,8 @@ def correct_element(
         above = np.uint32(position)
         fraction, below = position - np.float32(above), above + np.uint32(1)
         b = constant + down * np.float32(row) + slope * np.float32(column - side)
-        # whole vectors, of which the next row overwrites what is too long, where memory goes on so far
-        filled = (number + _LANES - 1) // _LANES * _LANES
-        if slot + filled > reference.size or column + number > last_column:
-            filled = number
-        for i in range(np.uint32(filled)):
+        filled = _filled(number, min(reference.size - slot, scales.shape[1] - column))
+        for i in range(np.uint32(filled)):  # the next row overwrites what is too long
             f, scale = reference[first + i], scales[above, from_column + i]
             scale += fraction * (scales[below, from_column + i] - scale)
             g = f - difference[first + i] - (b + slope * np.float32(np.int32(i)))
@@ -287,15 +298,19 @@ def _add(fields, begin, lines, run_offsets, e, top, bottom, side, columns, out):
             block, low, high = row // side, column, column
         low, high = min(low, column), max(high, column + number)
         at, to = np.uint64(slot) - begin, np.uint64(column)
-        # whole vectors, of which the last one may be too long, where memory goes on so far
-        filled = (number + _LANES - 1) // _LANES * _LANES
-        if np.int64(at) + filled > fields.shape[1]:
-            filled = number
+        filled = _filled(number, fields.shape[1] - np.int64(at))
         for n in range(len(fields)):
             for i in range(np.uint32(filled)):
                 value = fields[n, at + i]
                 columns[n, to + i] += value if np.int32(i) < np.int32(number) else _ZERO
     _flush(columns, low, high, side, block, out)
+
+
+@helper(forceinline=True)
+def _filled(number, room):
+    """Pixels of the whole vectors that hold a `number` of them; no more than these where memory has no `room`."""
+    filled = (number + _LANES - 1) // _LANES * _LANES
+    return filled if filled <= room else number
 
 
 @helper(fastmath=FAST)

@@ -61,8 +61,7 @@ class GainFit:
     def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
         """Prepare the gain over `values` (P,) with `weights` (P,)."""
         side = _block_side(sigma)
-        (sums,) = pixels.weighted_block_sums(values[None], weights, side)
-        (totals,) = pixels.block_sums(weights[None], side)
+        sums, totals = pixels.weighted_block_sums(values, weights, side, with_weight=True)
         total, x, y, xx, xy, yy = _moments(sums, sigma / side, 2)
         # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With
         # a tenth a slope of the light is followed too little at edges: coarse speckle errs there by twice as much
@@ -80,8 +79,7 @@ class GainFit:
 
     def block_sums(self, field: FloatImage) -> FloatArray:
         """Sum a field (P,) with the weights over the blocks, (h, w)."""
-        (sums,) = self.pixels.weighted_block_sums(field[None], self.weights, self.side)
-        return np.asarray(sums)
+        return np.asarray(self.pixels.weighted_block_sums(field, self.weights, self.side)[0])
 
     def gain(self, sums: FloatArray) -> FloatImage:
         """Return the gain (h, w) at the blocks of a field with such `sums`."""

@@ -95,5 +95,5 @@ def test_the_corrected_difference_is_that_of_the_naive_one(pixels):
 
 def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
     values, weight = np.random.default_rng(3).uniform(0, 1, (2, pixels.columns.size)).astype(np.float32)
-    (found,) = pixels.weighted_block_sums(values[None], weight, 4)
-    np.testing.assert_allclose(found, pixels.block_sums((weight * values)[None], 4)[0], rtol=1e-6)
+    found = pixels.weighted_block_sums(values, weight, 4, with_weight=True)
+    np.testing.assert_allclose(found, pixels.block_sums(np.stack([weight * values, weight]), 4), rtol=1e-6)
