@@ -220,7 +220,9 @@ def score_sums(
     """
     out[:, start:stop] = 0
     columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
-    scores, states = np.empty((2, 6, largest_element(offsets)), dtype=np.float32)
+    size = largest_element(offsets) + _LANES
+    # an array of its own: of a slice the compiler does not know that it is contiguous
+    scores, states = np.empty((len(out), size), dtype=np.float32), np.empty((4, size), dtype=np.float32)
     inside, one = np.empty(largest_element(offsets), dtype=np.float32), np.uint64(1)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
@@ -260,7 +262,7 @@ def score_sums(
                     mean = states[1, a + i] + states[1, b + i]
                     scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
                     scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
-        _add(scores[: len(out)], first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
 @helper()

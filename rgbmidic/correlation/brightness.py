@@ -18,7 +18,7 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import SlidingWindow, centred_products, window_sums
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+from rgbmidic.typing import FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
@@ -101,22 +101,14 @@ def local_gain_fits(
 
 
 def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
-    """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) of blocks in a window of `sigma` blocks."""
-    rows, columns = np.arange(len(sums), dtype=np.float64)[:, None], np.arange(sums.shape[1], dtype=np.float64)
-
-    def windowed(grid: FloatArray) -> AnyArray:
-        return cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-
-    total, x, y = windowed(sums), windowed(sums * columns), windowed(sums * rows)
-    moments = [total, x - columns * total, y - rows * total]
-    if order == 2:
-        xx, xy, yy = (windowed(sums * product) for product in (columns * columns, columns * rows, rows * rows))
-        moments += [
-            xx - columns * (2 * x - columns * total),
-            xy - columns * y - rows * (x - columns * total),
-            yy - rows * (2 * y - rows * total),
-        ]
-    return np.stack(moments)
+    """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) about blocks in a window of `sigma` blocks."""
+    reach = int(np.ceil(4 * sigma))
+    window, arm = cv2.getGaussianKernel(2 * reach + 1, sigma), np.arange(-reach, reach + 1.0)[:, None]
+    kernels = window, arm * window, arm * arm * window
+    powers = [(x, total - x) for total in range(order + 1) for x in range(total, -1, -1)]
+    return np.stack(
+        [cv2.sepFilter2D(sums, -1, kernels[x], kernels[y], borderType=cv2.BORDER_CONSTANT) for x, y in powers]
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
