@@ -107,6 +107,25 @@ class Residual:
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
+    def with_values(self, values: FloatImage) -> Residual:
+        """Return it for other grey levels (k, P) of the reference, with the brightness as it is.
+
+        Parameters
+        ----------
+        values : ndarray, shape (k, P), float32
+            Such as those of a reference before `Reference.filtered_as`.
+
+        Returns
+        -------
+        Residual
+        """
+        if values is self.reference.values:
+            return self
+        difference = values - self.reference.values
+        difference *= self.reference.inverse_level
+        difference += self.difference
+        return replace(self, difference=difference)
+
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
 

@@ -95,8 +95,10 @@ def next_weighting(
 ) -> Weighting:
     """Find matching, grey levels and precision anew at the displacement found by pass `number`."""
     residual, method = compare(problem, estimate), problem.method
+    # the residual that the pass has minimised: by other grey levels the displacement is not yet the best
+    minimised = residual.with_values(last.residual.reference.values)
     # without the precision of the lights, which the first pass has not, an element half on another body may match
-    precision = last.precision if number or method is None else method.precision(residual)
+    precision = last.precision if number or method is None else method.precision(minimised)
     matched = matching_elements(residual, estimate.displacement, precision)
     if not matched.all() or estimate.longest > problem.constants.first_pass_tolerance:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
@@ -109,7 +111,7 @@ def next_weighting(
         return weighting
     return replace(
         weighting,
-        precision=precision if number == 0 or method is None else method.precision(residual),
+        precision=precision if number == 0 or method is None else method.precision(minimised),
         weighting_displacement=estimate.displacement,
     )
 
