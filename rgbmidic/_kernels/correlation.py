@@ -252,14 +252,15 @@ def element_block_products(
 @compiled("elements", fastmath=FAST)
 def warped_weights(
     start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
-    elements, barycentric, displacement, weight, moments,
+    elements, barycentric, displacement, weight, moments, is_changed,
 ):  # fmt: skip
     """Warp the weights of one light to the owned pixels, and sum the grey levels of both states with them.
 
     `weight` (P,) float32 receives the `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced
     position (bilinear), 0 outside and beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other
     than 1: how many such blocks of `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f,
-    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,).
+    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,). `is_changed` (E,) says
+    where the weight may be another than that of the reference.
     """
     height, width = deformed_weight.shape
     for e in range(start, stop):
@@ -269,7 +270,7 @@ def warped_weights(
         left_x = top_y = np.float32(np.inf)
         right_x = bottom_y = -np.float32(np.inf)
         if run_offsets[e] == run_offsets[e + 1]:
-            moments[e] = 0.0
+            moments[e], is_changed[e] = 0.0, False
             continue
         begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
         for run in range(run_offsets[e], run_offsets[e + 1]):
@@ -280,7 +281,9 @@ def warped_weights(
                 left_x, right_x = min(left_x, px), max(right_x, px)
                 top_y, bottom_y = min(top_y, py), max(bottom_y, py)
         inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
-        if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
+        sides = base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y
+        is_changed[e] = not inside or _any_partial(partial, *sides)
+        if not is_changed[e]:
             for i in range(np.uint64(begin), np.uint64(end)):
                 weight[i] = reference_weight[i]
         else:

@@ -68,12 +68,14 @@ class Residual:
         values = reference.values
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
+        is_changed = np.empty(moments.shape[:2], dtype=bool)
         for light, displacement in enumerate(displacements):
             warp = reference.warp(deformed, light, displacement)
             differences(deformed.coefficients[light], values[light], *warp, difference[light])
             images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
-            warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
-        brightness = reference.brightness_of(weights, moments)
+            images += (reference.pixel_weights[light],)
+            warped_weights(*images, *warp, weights[light], moments[light], is_changed[light])
+        brightness = reference.brightness_of(weights, moments, is_changed.any(axis=1))
         for light, light_difference in enumerate(difference):
             fields = reference.brightness_fields(brightness, light, light_difference)
             pixels = reference.pixels
