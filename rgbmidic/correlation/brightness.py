@@ -139,7 +139,7 @@ class Brightness:
         """
         fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
         if fit is None:
-            side, grid = max(shape), np.full((1, 1), 1 / gain, dtype=np.float32)
+            side, grid = max(shape), np.full((1, 1), 1 / gain)
         else:
             side = fit.side
             rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
@@ -153,7 +153,7 @@ class Brightness:
         else:
             grid = np.pad(grid, 1, mode="edge")
         size = grid.shape[1] * side, grid.shape[0]
-        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), side
+        return np.asarray(cv2.resize(grid.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)), side
 
 
 _ELEMENTS = 300

@@ -73,9 +73,9 @@ class Residual:
             warp = reference.warp(deformed, light, displacement)
             differences(deformed.coefficients[light], values[light], *warp, difference[light])
             images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
-            images += (reference.pixel_weights[light],)
-            warped_weights(*images, *warp, weights[light], moments[light], is_changed[light])
-        brightness = reference.brightness_of(weights, moments, is_changed.any(axis=1))
+            states = *images, reference.pixel_weights[light]
+            warped_weights(*states, *warp, weights[light], moments[light], is_changed[light])
+        brightness = reference.brightness_of(weights, moments, np.asarray(is_changed.any(axis=1)))
         for light, light_difference in enumerate(difference):
             fields = reference.brightness_fields(brightness, light, light_difference)
             pixels = reference.pixels
