@@ -7,7 +7,7 @@ of the front's own: known at every point, and so are its rates.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,17 +15,16 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from rgbmidic import Result, TestSettings, measure
-from rgbmidic.fields import rates
+from rgbmidic.fields import Nodal, make_probe, rates, reference_fraction
 from rgbmidic.frames import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.results.histories import read_histories
+from rgbmidic.results.result_in_units import ResultInUnits, displacements
 from rgbmidic.scene.camera import REFERENCE_CROSSTALK
-from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
-from .standing_glare import BLACK, GAIN, READ_NOISE, WHITE, Paint, expose
+from .standing_glare import GAIN, READ_NOISE, Paint, expose
 from .tables import Row, table
 from .uncertainty import rms
 
@@ -34,7 +33,9 @@ RECTANGLE = [20, 30, 380, 170]
 POISSON, STRAIN = 0.3, -0.01
 SPEED, FRONT, ARRIVES = 25.0, 125.0, 8.0
 """px/frame; px that the front is long, five frames; frame in which it enters the frame at x = 0."""
-REST, FRAMES = 4, 32
+REST, FRAMES, WINDOW = 4, 32, 7
+STEP = 0.01
+"""Frames before and after one from which the exact rates are taken."""
 GLARES = np.array([(-40.0, 70.0, 11.0), (-10.0, 110.0, 9.0), (30.0, 140.0, 10.0)])
 """x and y of each light's glare in frame 0, px, and its speed, px/frame."""
 SPREAD, LEVEL = 20.0, 4.0
@@ -98,17 +99,118 @@ class Strip:
         return mosaics
 
 
-def measured(strip: Strip, folder: Path, element_size: float, **sections: dict[str, object]) -> Result:
+def measured(strip: Strip, folder: Path, mesh: dict[str, object]) -> Result:
     """Measure the strip through raw frames, calibration file and settings, as a user does."""
     Calibration(
         crosstalk=Crosstalk(matrix=np.array(REFERENCE_CROSSTALK), lights=("red", "green", "blue")),
         noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE),
     ).write(folder / "calibration.json")
-    ring = HOLE + (RADIUS + 2.5) * np.stack([f(np.linspace(0, 2 * np.pi, 25)[:-1]) for f in (np.cos, np.sin)], axis=1)
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = HOLE + (RADIUS + 2.5) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     settings = {
         "frames": {"path": [], "reference": f"0:{REST}"},
         "calibration": {"file": "calibration.json"},
         "region": {"rectangle": RECTANGLE, "holes": [ring.tolist()]},
-        "mesh": {"element_size": element_size},
-    } | sections
+        "mesh": mesh,
+    }
     return measure(TestSettings.from_mapping(settings, folder), folder / "result", source=strip.frames(), workers=1)
+
+
+def places(points: FloatArray, glare_reach: float, is_glaring: bool) -> dict[str, BoolArray]:
+    """Rows of the table: which frames and points (T, P) belong to each; without those at the ends of the test."""
+    frame = np.arange(float(FRAMES))[:, None]
+    start, end = (np.minimum(points[:, 0], HOLE[0]), np.maximum(points[:, 0], HOLE[0]) + FRONT)
+    arrived, passed = (SPEED * (frame - ARRIVES) > x for x in (start, end))
+    rim = np.broadcast_to(np.hypot(*(points - HOLE).T) < RADIUS + 4, arrived.shape)
+    glare = np.zeros_like(arrived)
+    for x, y, speed in GLARES[: len(GLARES) if is_glaring else 0]:
+        glare |= np.hypot(points[:, 0] - x - speed * frame, points[:, 1] - y) < glare_reach
+    inner = (frame >= REST) & (frame < FRAMES - 3)
+    found = {
+        "rim": rim & arrived,
+        "before the front": ~arrived & ~glare & ~rim,
+        "while it passes": arrived & ~passed & ~glare & ~rim,
+        "after it": passed & ~glare & ~rim,
+    }
+    if is_glaring:
+        found |= {"in glare, before or after": glare & ~(arrived & ~passed) & ~rim}
+        found |= {"in glare, while it passes": glare & arrived & ~passed & ~rim}
+    return {name: mask & inner for name, mask in found.items()}
+
+
+def rate(values: FloatArray, std: FloatArray, truth: FloatArray) -> FloatArray:
+    """Error over stated uncertainty (T, P) of the rate of values; `truth` (2, T, P) is just before and after each."""
+    times = np.arange(float(FRAMES))
+    found = rates(
+        times, values, std, window=WINDOW - 1.0, common_fraction=reference_fraction(REST), references=times < REST
+    )
+    return np.asarray((found.velocity - (truth[1] - truth[0]) / (2 * STEP)) / found.velocity_std)
+
+
+def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
+    """Row, quantity, errors and errors over stated uncertainty of a result."""
+    physical = ResultInUnits.without_times(result)
+    length, nodes = 3 * physical.mesh.size, result.nodes.astype(np.float64)
+    truth = np.stack([[strip.displacement(nodes, i + step) for i in range(FRAMES)] for step in (-STEP, 0, STEP)])
+    step = np.array([0.05, 0.0])
+    strain = np.stack(
+        [strip.displacement(nodes + step, i) - strip.displacement(nodes - step, i) for i in range(FRAMES)]
+    )[..., 0]
+    errors = {
+        "u, v": (np.stack([result.u, result.v]) - np.moveaxis(truth[1], -1, 0), np.stack([result.u_std, result.v_std])),
+        "strain": (result.nodal_exx - strain / (2 * step[0]), result.nodal_exx_std),
+    }
+    for name, mask in places(nodes, 2 * SPREAD, strip.is_glaring).items():
+        for quantity, (error, std) in errors.items():
+            chosen = np.broadcast_to(mask, error.shape)
+            yield name, quantity, error[chosen], error[chosen] / std[chosen]
+    velocity = rate(result.u, result.u_std, truth[::2, ..., 0])
+    for name, mask in places(nodes, 2 * SPREAD, strip.is_glaring).items():
+        yield name, "velocity", velocity[mask], velocity[mask]
+    grid = np.stack(np.meshgrid(np.arange(50.0, 360, 30), [65.0, 100.0, 135.0]), axis=-1).reshape(-1, 2)
+    grid = grid[np.hypot(*(grid - HOLE).T) > RADIUS + length / 2 + 4]
+    gauges = [make_probe(physical.covariance, "strain_gauge", 1, (x, y, length)) for x, y in grid]
+    fields = np.stack(list(displacements(result, physical.rectified, list(range(FRAMES)))), axis=1)
+    exact = [np.concatenate([np.moveaxis(part, -1, 0), np.full((2, *part.shape[:2]), STEP)]) for part in truth]
+    series = [[gauge.histories(Nodal.of(part[..., gauge.nodes]))[0] for gauge in gauges] for part in (fields, *exact)]
+    found, *true = (np.stack([one.values for one in row], axis=1) for row in series)
+    std = np.stack([one.std for one in series[0]], axis=1)
+    strain_rate = rate(found, std, np.stack(true[::2]))
+    for name, mask in places(grid, 2 * SPREAD, strip.is_glaring).items():
+        yield name, "gauge", (found - true[1])[mask], ((found - true[1]) / std)[mask]
+        yield name, "strain rate", strain_rate[mask], strain_rate[mask]
+
+
+@table("hole_trial", page="explanation/uncertainty", cost=150, keys=3)
+def hole_trial(quick: bool) -> Iterator[Row]:
+    """A strip with a hole of 48 px (raw Bayer frames, 12 bit), rest, then a front of 125 px within five frames that
+    brings 1 % of compression and Kirsch's field around the hole; without and with three glares of four times the
+    paint's level that saturate and travel: rms error of nodes, error over stated uncertainty of displacement and
+    strain of nodes, of a gauge of three elements, of velocity and of the gauge's strain rate over 7 frames.
+    """
+    cases = [(size, is_glaring) for size in (18.0, 12.0, 9.0) for is_glaring in (False, True)]
+    for size, is_glaring in [(18.0, True)] if quick else cases:
+        collected: dict[str, dict[str, list[FloatArray]]] = {}
+        for draw in range(1 if quick else 3):
+            with tempfile.TemporaryDirectory() as folder:
+                strip = Strip(draw, is_glaring)
+                result = measured(strip, Path(folder), {"element_size": size})
+                for place, quantity, error, ratio in ratios(strip, result):
+                    row = collected.setdefault(place, {})
+                    row.setdefault(f"{quantity} error", []).append(error)
+                    row.setdefault(quantity, []).append(ratio)
+        for place, row in collected.items():
+            figure = {name: rms(np.concatenate(values)) for name, values in row.items()}
+            missing = float("nan")
+            yield {
+                "elements [px]": f"{size:g}",
+                "glare": "three" if is_glaring else "none",
+                "where and when": place,
+                "u, v [px]": figure["u, v error"],
+                "u, v: error/stated": figure["u, v"],
+                "exx [1e-6]": 1e6 * figure["strain error"],
+                "exx: error/stated": figure["strain"],
+                "gauge: error/stated": figure.get("gauge", missing),
+                "velocity: error/stated": figure["velocity"],
+                "strain rate: error/stated": figure.get("strain rate", missing),
+            }
