@@ -181,17 +181,18 @@ def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray,
         yield name, "strain rate", strain_rate[mask], strain_rate[mask]
 
 
-@table("hole_trial", page="explanation/uncertainty", cost=150, keys=3)
+@table("hole_trial", page="explanation/uncertainty", cost=90, keys=3)
 def hole_trial(quick: bool) -> Iterator[Row]:
     """A strip with a hole of 48 px (raw Bayer frames, 12 bit), rest, then a front of 125 px within five frames that
     brings 1 % of compression and Kirsch's field around the hole; without and with three glares of four times the
     paint's level that saturate and travel: rms error of nodes, error over stated uncertainty of displacement and
-    strain of nodes, of a gauge of three elements, of velocity and of the gauge's strain rate over 7 frames.
+    strain of nodes, of gauges of three elements, of velocity and of the gauges' strain rate over 7 frames. Glare: nodes
+    and gauges within 40 px of the middle of one. The front passes from its arrival until it has passed node and hole.
     """
-    cases = [(size, is_glaring) for size in (18.0, 12.0, 9.0) for is_glaring in (False, True)]
+    cases = [(size, is_glaring) for size in (18.0, 9.0) for is_glaring in (False, True)]
     for size, is_glaring in [(18.0, True)] if quick else cases:
         collected: dict[str, dict[str, list[FloatArray]]] = {}
-        for draw in range(1 if quick else 3):
+        for draw in range(1 if quick else 2):
             with tempfile.TemporaryDirectory() as folder:
                 strip = Strip(draw, is_glaring)
                 result = measured(strip, Path(folder), {"element_size": size})

@@ -22,6 +22,10 @@ At a lower price rates are noisier at rest, at a higher one the jerk that begins
 _OLD, _FAINT, _ROOM = 3, 6.0, 16
 """A piece's start is followed for so many windows, whatever its odds (a weak kink takes two to show), and longer if its
 log odds are above `-_FAINT`, 1 in 400, and it is among the so many first of those."""
+_CORRELATION = 0.7
+"""Correlation from frame to frame of what a variance exceeds those around it by, as while a reflection passes: .69 of
+the strain in travelling glare (benchmarks/hole_trial.py); .58 to .72 makes a slope over 7 to 11 frames least certain
+(derived)."""
 _NONE = np.int64(-1)
 """No index; a literal would compile what it is given to once more."""
 _NEVER = 12.0
@@ -290,22 +294,38 @@ def _average(t, y, w, frames, times, count, starts, ends, chances, base, work, s
 
 
 @helper()
-def _conclude(w, frames, reference, base, sums, lines, out):
+def _excess_std(t, w, out):
+    """Root of what the variance of each value exceeds twice the least within a window to both sides by.
+
+    Less is how variances differ from frame to frame without a reflection.
+    """
+    for j in range(t.size):
+        out[j] = 0.0
+        for k in range(np.searchsorted(t, t[j] - 1), np.searchsorted(t, t[j] + 1, side="right")):
+            out[j] = max(out[j], 1 / w[j] ** 2 - 2 / w[k] ** 2)
+        out[j] = np.sqrt(out[j])
+
+
+@helper()
+def _conclude(w, excess, frames, reference, base, sums, lines, out):
     """Means and their variances (2, 7, T) from what `_add_window` added up.
 
-    The variance of the mean in noise, the spread of what it is taken over, and what an onset hides next to the ends of
-    pieces; for one side, where `lines` does not give the first, the mean of the variances. Of the value, the part that
-    the reference adds to all is left out.
+    The variance of the mean in noise, of which `excess` (n,) is correlated from frame to frame, the spread of what it
+    is taken over, and what an onset hides next to the ends of pieces; for one side, where `lines` does not give the
+    first, the mean of the variances. Of the value, the part that the reference adds to all is left out.
     """
     for i in range(base.size):
         for o in range(3):
             weight = sums[:, i, o, 0].sum()
             if weight == 0:
                 continue
-            mean, chance = sums[:, i, o, 1].sum() / weight, 0.0
+            mean, chance, passing, last = sums[:, i, o, 1].sum() / weight, 0.0, 0.0, base[i]
             for j in range(base[i], min(base[i] + lines.shape[2], frames.size)):
                 line = lines[i, o, j - base[i]] / weight
                 chance += (line**2 - (2 * line * reference[frames[j]] if o == 0 else 0.0)) / w[j] ** 2
+                passing *= _CORRELATION ** (frames[j] - frames[last])
+                chance += 2 * line * excess[j] * passing
+                passing, last = passing + line * excess[j], j
             spread = max(sums[:, i, o, 2].sum() / weight - mean**2, 0.0)
             onset = sums[:, i, o, 4].sum() / weight
             out[0, o, i], out[1, o, i] = mean, chance + spread + onset
@@ -335,7 +355,7 @@ def mean_rates(start, stop, times, values, noise, common, reference, max_frames,
     room = size * (young + _ROOM + 1)
     starts, ends = np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64)
     logs, before = np.zeros((room, HIGHEST - LOWEST + 1)), np.zeros(size + 1)
-    sums, lines = np.zeros((3, size, 3, 5)), np.zeros((size, 3, width))
+    sums, lines, excess = np.zeros((3, size, 3, 5)), np.zeros((size, 3, width)), np.zeros(size)
     top = HIGHEST + 1
     work = (
         np.zeros(top),
@@ -361,7 +381,8 @@ def mean_rates(start, stop, times, values, noise, common, reference, max_frames,
         _probabilities(n, count, starts, ends, logs, before)
         sums[:], lines[:] = 0.0, 0.0
         _average(t[:n], y[:n], w[:n], frames, times, count, starts, ends, logs, base, work, sums, lines)
-        _conclude(w[:n], frames[:n], reference, base, sums, lines, out[column])
+        _excess_std(t[:n], w[:n], excess)
+        _conclude(w[:n], excess, frames[:n], reference, base, sums, lines, out[column])
         for i in range(size):
             out[column, 0, 0, i] += origin
             out[column, 1, 0, i] += common[column, i]

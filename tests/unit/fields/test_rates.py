@@ -140,6 +140,20 @@ def test_noise_at_rest_is_hardly_more_than_that_of_one_parabola():
         assert getattr(found, name)[3:-3].std() <= 1.15 * (lines @ row).std()
 
 
+def test_what_a_passing_reflection_adds_is_correlated_from_frame_to_frame():
+    """Eight frames with six times the noise, whose excess has a correlation of .7: 1.4 without regard to it."""
+    random, passing = np.random.default_rng(3), (EVEN > 16) & (EVEN < 25)
+    excess, draws = np.zeros((41, 300)), random.normal(size=(41, 300))
+    for i in np.flatnonzero(passing):
+        excess[i] = 0.7 * excess[i - 1] + (draws[i] if i == 17 else np.sqrt(1 - 0.49) * draws[i])
+    values = random.normal(size=(41, 300)) + np.sqrt(35) * excess
+    std = np.where(passing, 6.0, 1.0)[:, None] * np.ones(300)
+    found = rates(EVEN, values, std, window=6, common_fraction=0.0, references=NONE)
+    ratio = found.velocity / found.velocity_std
+    for state, (low, high) in ((passing, (0.8, 1.2)), (~passing, (0.8, 1.1))):
+        assert low <= np.sqrt(np.mean(ratio[3:-3][state[3:-3]] ** 2)) <= high
+
+
 def test_lost_frames_at_an_onset_make_no_motion_before_it():
     motion = 0.5 * np.maximum(EVEN - 20, 0)
     values = motion[:, None] + 0.01 * np.random.default_rng(8).normal(size=(41, 60))
