@@ -133,8 +133,8 @@ def places(points: FloatArray, glare_reach: float, is_glaring: bool) -> dict[str
         "after it": passed & ~glare & ~rim,
     }
     if is_glaring:
-        found |= {"in glare, before or after": glare & ~(arrived & ~passed) & ~rim}
-        found |= {"in glare, while it passes": glare & arrived & ~passed & ~rim}
+        found |= {"in glare before or after it": glare & ~(arrived & ~passed) & ~rim}
+        found |= {"in glare while it passes": glare & arrived & ~passed & ~rim}
     return {name: mask & inner for name, mask in found.items()}
 
 
@@ -207,8 +207,8 @@ def hole_trial(quick: bool) -> Iterator[Row]:
                 "elements [px]": f"{size:g}",
                 "glare": "three" if is_glaring else "none",
                 "where and when": place,
-                "u, v [px]": figure["u, v error"],
-                "u, v: error/stated": figure["u, v"],
+                "u and v [px]": figure["u, v error"],
+                "u and v: error/stated": figure["u, v"],
                 "exx [1e-6]": 1e6 * figure["strain error"],
                 "exx: error/stated": figure["strain"],
                 "gauge: error/stated": figure.get("gauge", missing),

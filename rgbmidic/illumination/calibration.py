@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
-from rgbmidic.arguments import check_fields
+from rgbmidic.arguments import check_fields, checked
 from rgbmidic.disk import write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
@@ -171,6 +171,7 @@ class Calibration:
         )
 
     @classmethod
+    @checked
     def read(cls, path: Path | str) -> Calibration:
         """Read a calibration file.
 

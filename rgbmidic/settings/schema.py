@@ -19,6 +19,7 @@ from rgbmidic.settings.conversion import (
     CheckedSettings,
     bounded,
     check_names,
+    convert_value,
     read_section,
     read_table,
     read_toml,
@@ -386,7 +387,7 @@ def read_test(path: Path | str) -> TestSettings:
     >>> settings.mesh.element_size, settings.region.rectangle
     (20.0, (10.0, 10.0, 90.0, 70.0))
     """
-    path = Path(path)
+    path = convert_value(path, Path, "read_test: path")
     document = read_toml(path, "settings file")
     try:
         return TestSettings.from_mapping(document, path.parent)
