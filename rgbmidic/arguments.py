@@ -90,10 +90,10 @@ def _converted(value: Any, hint: Any, label: str, error: type[RgbmidicError]) ->
 
 
 def _classes(kinds: tuple[Any, ...]) -> tuple[type, ...]:
-    """Classes that a value must be of one of; empty where one of the kinds is neither a class of ours nor a mapping."""
+    """Return the classes of which a value must be; none where a kind is neither one of the package's nor a mapping."""
     origins = [get_origin(kind) or kind for kind in kinds if kind is not NoneType]
     is_ours = all(
-        kind is Mapping
+        kind in (Mapping, dict)
         or (
             isinstance(kind, type)
             and kind.__module__.startswith("rgbmidic.")

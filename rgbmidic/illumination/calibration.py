@@ -197,6 +197,7 @@ class Calibration:
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
+    @checked
     def from_document(cls, document: dict[str, Any], name: str = "the calibration") -> Calibration:
         """Return the calibration of a JSON document.
 

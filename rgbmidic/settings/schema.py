@@ -332,7 +332,9 @@ class TestSettings(CheckedSettings):
         ConfigurationError
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
-        base, kinds = Path(base).resolve(), section_types()
+        if not isinstance(document, Mapping):
+            raise ConfigurationError(f"the document of a test maps sections to their keys; given is {document!r:.80}")
+        base, kinds = convert_value(base, Path, "base").resolve(), section_types()
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
@@ -387,12 +389,12 @@ def read_test(path: Path | str) -> TestSettings:
     >>> settings.mesh.element_size, settings.region.rectangle
     (20.0, (10.0, 10.0, 90.0, 70.0))
     """
-    path = convert_value(path, Path, "read_test: path")
-    document = read_toml(path, "settings file")
+    file: Path = convert_value(path, Path, "read_test: path")
+    document = read_toml(file, "settings file")
     try:
-        return TestSettings.from_mapping(document, path.parent)
+        return TestSettings.from_mapping(document, file.parent)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{path}: {error}") from None
+        raise ConfigurationError(f"{file}: {error}") from None
 
 
 _FORMER_BRIGHTNESS = {"global": "constant", "local": "auto", "mean": "auto"}
