@@ -334,13 +334,14 @@ class TestSettings(CheckedSettings):
         """
         if not isinstance(document, Mapping):
             raise ConfigurationError(f"the document of a test maps sections to their keys; given is {document!r:.80}")
-        base, kinds = convert_value(base, Path, "base").resolve(), section_types()
+        folder: Path = convert_value(base, Path, "base").resolve()
+        kinds = section_types()
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
         document = without_former_keys(document)
-        sections = {name: read_section(kinds[name], name, read_table(document, name), base) for name in document}
-        return cls(base=base, **sections)
+        sections = {name: read_section(kinds[name], name, read_table(document, name), folder) for name in document}
+        return cls(base=folder, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
         """Return the settings as sections of plain values, defaults included, without `base` and what is not known.
