@@ -175,7 +175,7 @@ def inspect_frame(
     >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
     ('monochrome', True, 0.0)
     """
-    frames = tuple(frame) if isinstance(frame, Sequence) and not isinstance(frame, str | bytes) else (frame,)
+    frames = tuple(frame) if isinstance(frame, Sequence) else (frame,)
     shape = _require_shape(frames)
     cropped_calibration = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
