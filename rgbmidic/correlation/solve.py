@@ -135,11 +135,14 @@ def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, e
     """Return the pass up to which the weights are learnt anew.
 
     Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
-    pass in which they do the residual is still that of a wrong match. It is learnt once more where it was elsewhere.
+    pass in which they do the residual is still that of a wrong match. It is learnt once more where it was elsewhere,
+    and twice where another body at the region's rim has drawn the edge.
     """
     if (matched & ~last.matched).any():
         return number + 1
     constants = last.residual.reference.constants
+    if last.precision is not None and last.precision.rim_differs:
+        return max(last.reweight_until, constants.max_reactivation_passes)
     motion = np.hypot(*(estimate.displacement - last.weighting_displacement).T)[equations.textured]
     has_moved = (
         number == 1 < len(last.residual.weights)
@@ -334,7 +337,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
-    inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
+    positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
+    inside = problem.deformed.contains(positions, std[:, :2])
     node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any() and np.isnan(std[equations.textured]).all():
