@@ -137,10 +137,13 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+    rim_differs
+        The rim of the region shows another body somewhere, which has drawn the residual's displacement.
     """
 
     factor: FloatImage
     loss_curvature: FloatImage
+    rim_differs: bool = False
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.

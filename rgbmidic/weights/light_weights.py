@@ -362,6 +362,9 @@ class Statistics(ValidPixels):
         Least variance of a residual, over that of the grey levels, where two images are the same: none is 0.
     independent_fraction
         Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same.
+    rim_excess
+        Variance at the rim of the region over that inside from which the rim shows another body, such as a background
+        at rest, and has its own: of the some 16 values of a window chance makes 4 times in 1 of 1e7 (derived).
     window
         In which variances are found.
     """
@@ -370,6 +373,7 @@ class Statistics(ValidPixels):
     least_variance: float = 0.1
     rounding: float = 1e-6
     independent_fraction: float = 0.1
+    rim_excess: float = 4.0
     window: SlidingWindow = WINDOW
 
     def precision(self, residual: Residual) -> Precision:
@@ -381,8 +385,10 @@ class Statistics(ValidPixels):
         variance of that mean's residual to the power .75, for it is itself uncertain, times the part of it that
         displaces: brightness and contrast that change slowly leave a residual which the gradient of the speckle
         averages out, blurred noise one that it does not. It holds whatever corrupts the mean there: camera noise,
-        demosaicing, the erratic part of a reflection. Its unit is the median over the region. The pixel's own factor is
-        that of a Student distribution, so that dust or a fragment does not corrupt a node.
+        demosaicing, the erratic part of a reflection. Its unit is the median over the region. The rim, whose filtered
+        grey levels hold some of what lies beyond the region, is judged by itself: beside a background at rest it hardly
+        counts. The pixel's own factor is that of a Student distribution, so that dust or a fragment does not corrupt a
+        node.
 
         Parameters
         ----------
@@ -403,12 +409,21 @@ class Statistics(ValidPixels):
         factor = pixels.from_blocks(_best_fractions(covariance, floor, self.independent_fraction), self.window.step)
         mean, has_weight, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, has_weight)
-        variance, min_variance = self.window.covariance(pixels, mean[None], has_weight[None])[0], floor / len(factor)
-        variance_map = pixels.from_blocks(np.maximum(variance, min_variance), self.window.step)[0]
-        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
+        rim, min_variance = residual.reference.rim, floor / len(factor)
+        variance, rim_variance = (
+            self.window.covariance(pixels, mean[None], counted[None])[0]
+            for counted in (has_weight * (1 - rim), has_weight * rim)
+        )
         unit = max(np.float32(_typical(variance)), min_variance)
+        variance, rim_variance = np.maximum((variance, rim_variance), min_variance)
+        variance_map = pixels.from_blocks(variance, self.window.step)[0]
+        rim_differs = rim_variance > self.rim_excess * variance
+        if rim_differs.any():
+            rim_map = pixels.from_blocks(np.where(rim_differs, rim_variance, variance), self.window.step)[0]
+            np.copyto(variance_map, rim_map, where=rim > 0)
+        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
-        return Precision(factor=factor, loss_curvature=bend)
+        return Precision(factor=factor, loss_curvature=bend, rim_differs=bool(rim_differs.any()))
 
 
 def _typical(variance: FloatImage) -> float:
