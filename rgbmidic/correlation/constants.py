@@ -119,8 +119,9 @@ class SolverConstants:
     least_gain
         Least local gain over that of the light: where a shadow takes 95 % of it, it is not amplified any further.
     gain_window_factor
-        Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 noise-free coarse
-        speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py).
+        Standard deviation of the window of the gain in correlation lengths of the speckle. With 6 a shadow's edge errs
+        by 1.4 times as much, vignetting of coarse speckle by 2.4 times; with 3 plain speckle by up to 4 % more
+        (benchmarks/grey_levels.py, benchmarks/public_pairs.py).
     min_gain_window
         ... and at least, px: one and a half blocks of its grid.
     min_block_side
@@ -199,7 +200,7 @@ class SolverConstants:
     min_participation: float = 0.1
     min_gain_correlation: float = 0.3
     least_gain: float = 0.05
-    gain_window_factor: float = 6.0
+    gain_window_factor: float = 4.0
     min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75
