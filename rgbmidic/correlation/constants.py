@@ -119,9 +119,15 @@ class SolverConstants:
     least_gain
         Least local gain over that of the light: where a shadow takes 95 % of it, it is not amplified any further.
     gain_window_factor
-        Standard deviation of the window of the gain in correlation lengths of the speckle. With 6 a shadow's edge errs
-        by 1.4 times as much, vignetting of coarse speckle by 2.4 times; with 3 plain speckle by up to 4 % more
-        (benchmarks/grey_levels.py, benchmarks/public_pairs.py).
+        Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 borders of the
+        frame and plain speckle err by up to 3 % more, with 3 by 4 % (benchmarks/grey_levels.py, public_pairs.py).
+    max_smooth_fraction
+        Fraction of the squared residual in its means over blocks of that window, from which the light changes within
+        it: a highlight that is added has .23, a shadow's edge .34, vignetting of coarse speckle .5 to .7, reflections
+        on several lights .2, plain speckle .06 or less.
+    gain_window_ratio
+        The window over the narrower one that follows such a light: plain speckle then errs by 3 % more, a shadow's edge
+        by half (benchmarks/grey_levels.py).
     min_gain_window
         ... and at least, px: one and a half blocks of its grid.
     min_block_side
@@ -200,7 +206,9 @@ class SolverConstants:
     min_participation: float = 0.1
     min_gain_correlation: float = 0.3
     least_gain: float = 0.05
-    gain_window_factor: float = 4.0
+    gain_window_factor: float = 6.0
+    max_smooth_fraction: float = 0.22
+    gain_window_ratio: float = 3.0
     min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75

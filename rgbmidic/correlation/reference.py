@@ -426,6 +426,24 @@ class Reference:
         fits = local_gain_fits(values, self.pixel_weights, self.pixels, self.gain_window)
         return replace(self, values=values, gain_fits=fits)
 
+    def with_gain_window(self, sigma: float) -> Reference:
+        """Return the reference with a gain that is smooth over a narrower window.
+
+        Parameters
+        ----------
+        sigma
+            Standard deviation of the window, px.
+
+        Returns
+        -------
+        Reference
+        """
+        fits, gradient = local_gain_fits(self.values, self.pixel_weights, self.pixels, sigma), self.gradient.copy()
+        for light, fit in enumerate(fits):
+            for axis in gradient[:, light]:
+                axis[:] = fit.remainder(axis / self.inverse_level[light], self.values[light])
+        return replace(self, gain_fits=fits, gradient=gradient * self.inverse_level)
+
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
 

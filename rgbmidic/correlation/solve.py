@@ -242,13 +242,8 @@ def _passes(
         estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            reference = with_consistent_gradient(weighting.residual, weighting.weights()).filtered_as(
-                estimate.displacement
-            )
-            if reference is not problem.reference:
-                same, problem = reference.values is problem.reference.values, replace(problem, reference=reference)
-                residual = replace(weighting.residual, reference=reference) if same else compare(problem, estimate)
-                weighting, equations = replace(weighting, residual=residual), None
+            adapted, weighting = _adapt_reference(problem, weighting, estimate)
+            problem, equations = adapted, equations if adapted is problem else None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
@@ -261,6 +256,29 @@ def _passes(
             estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, estimate))
     return problem, estimate, equations, weighting
+
+
+def _adapt_reference(problem: Problem, weighting: Weighting, estimate: Estimate) -> tuple[Problem, Weighting]:
+    """Adapt the reference's gradients, window of the gain and filter to what the first pass shows.
+
+    The problem is the same object where nothing changes.
+    """
+    constants, before, weights = problem.constants, problem.reference, weighting.weights()
+    matched = with_consistent_gradient(weighting.residual, weights)
+    window = matched.gain_window if before.brightness == "auto" else None
+    narrows = window is not None and weighting.residual.smooth_fraction(weights) > constants.max_smooth_fraction
+    if window is not None and narrows:
+        matched = matched.with_gain_window(window / constants.gain_window_ratio)
+    reference = matched.filtered_as(estimate.displacement)
+    if reference is before:
+        return problem, weighting
+    problem = replace(problem, reference=reference)
+    if reference.gain_fits is before.gain_fits:
+        return problem, replace(weighting, residual=replace(weighting.residual, reference=reference))
+    residual, precision = compare(problem, estimate), weighting.precision
+    if narrows and problem.method is not None:
+        precision = problem.method.precision(residual)
+    return problem, replace(weighting, residual=residual, precision=precision)
 
 
 @stage("search")
