@@ -105,28 +105,19 @@ class Residual:
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
-    def smooth_fraction(self, weights: FloatImage) -> float:
-        """Return the fraction of the squares that is alike over blocks of the gain's window.
-
-        It is 0 where the gain is one number.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (k, P)
-            Weights of the solve.
-
-        Returns
-        -------
-        float
-        """
+    @property
+    def smooth_fraction(self) -> float:
+        """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
         pixels, window = self.reference.pixels, self.reference.gain_window
         if window is None:
             return 0.0
         smooth, side = 0.0, block_side(window)
-        for residual, weight, total in zip(self.difference, weights, pixels.block_sums(weights, side), strict=True):
+        for residual, weight, total in zip(
+            self.difference, self.weights, pixels.block_sums(self.weights, side), strict=True
+        ):
             (sums,) = pixels.weighted_block_sums(residual[None], weight, side)
             smooth += float((sums**2 / np.maximum(total, 1e-30)).sum())
-        return smooth / max(float(self.squares(weights)[..., 0].sum()), 1e-300)
+        return smooth / max(float(self.squares(self.weights)[..., 0].sum()), 1e-300)
 
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.

@@ -263,10 +263,10 @@ def _adapt_reference(problem: Problem, weighting: Weighting, estimate: Estimate)
 
     The problem is the same object where nothing changes.
     """
-    constants, before, weights = problem.constants, problem.reference, weighting.weights()
-    matched = with_consistent_gradient(weighting.residual, weights)
+    constants, before = problem.constants, problem.reference
+    matched = with_consistent_gradient(weighting.residual, weighting.weights())
     window = matched.gain_window if before.brightness == "auto" else None
-    narrows = window is not None and weighting.residual.smooth_fraction(weights) > constants.max_smooth_fraction
+    narrows = window is not None and weighting.residual.smooth_fraction > constants.max_smooth_fraction
     if window is not None and narrows:
         matched = matched.with_gain_window(window / constants.gain_window_ratio)
     reference = matched.filtered_as(estimate.displacement)
