@@ -53,14 +53,12 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     bias : ndarray, shape (N, 2)
         What is to be added to the displacement, px.
     std : ndarray, shape (N, 5)
-        Standard uncertainty that is left of u, v, exx, eyy and exy: a bias that is alike over the reach of the window
-        changes by so much over it.
+        Standard uncertainty that is left of u, v, exx, eyy and exy: the slopes have that of a field of its correlation.
     """
     nodes, constants, count = table.reference.mesh.nodes, table.reference.constants, len(table.sums)
-    reach = constants.bias_range
     if count == 1:
         return np.zeros_like(nodes), np.zeros((len(nodes), 5))
-    displacement, variance, information = table.displacement(reach)
+    displacement, variance, information = table.displacement(constants.bias_range)
     local, chance, _ = table.displacement(constants.local_bias_range)
     local_change = local - displacement
     gain = np.maximum(1 - constants.local_bias_threshold * chance / np.maximum((local_change**2).sum(axis=1), 1e-30), 0)
@@ -74,7 +72,10 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
     residual_variance = count / (count - 1) * (fractions[:, None] ** 2 * scatter).sum(axis=0)
     residual_variance += ((fractions - precision)[:, None] * local_change).sum(axis=0) ** 2
+    along, across = constants.bias_directions
+    residual_variance = along * residual_variance + across * residual_variance[::-1]
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
+    reach = np.sqrt(2) * constants.bias_correlation_range
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)
