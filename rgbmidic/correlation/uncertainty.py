@@ -247,8 +247,8 @@ def excess_over_chance(
     Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
     uncertainty as the scores of what a light alone shows have of all scores, typically. Where a reflection does not
     follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md). A single step is a poor estimate of its variance: it is that of both directions
-    at the nodes of the elements around.
+    (docs/explanation/uncertainty.md). A single step is a poor estimate of its variance: both directions have
+    their mean.
 
     Parameters
     ----------
@@ -259,14 +259,10 @@ def excess_over_chance(
     weights : ndarray, shape (k, P), float32
         Of the solve.
     """
-    reference, mesh = table.reference, table.reference.mesh
+    reference = table.reference
     images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
         (images.sums - table.sums[:, :4])[0, :2]
     )
     square = ((step / np.maximum(std, 1e-30)) ** 2).mean(axis=1)
-    counted = np.isfinite(square)
-    total, count = (
-        mesh.to_nodes(values[mesh.elements].sum(axis=1)) for values in (np.where(counted, square, 0), counted)
-    )
-    return np.sqrt(np.maximum(total / np.maximum(count, 1) - chance, 0))
+    return np.asarray(np.sqrt(np.maximum(square - chance, 0)))
