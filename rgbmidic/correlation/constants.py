@@ -157,14 +157,12 @@ class SolverConstants:
         Range r (px) of the correlation ``exp(-d^2 / (4 r^2))`` of what the lights' bias leaves at two places a distance
         d apart: a bias changes over some 50 px, and is seen in a window of `bias_range`. 32 to 36 px fit errors on
         raised droplets of two renderers under three lights, 47 to 53 px under two lamps in succession (measured).
-    bias_directions
-        Fractions of the variance estimated in a direction that are stated in it and across it. An estimate from two or
-        three lights has few degrees of freedom, and the lights' biases cancel in part, because their lamps stand on
-        different sides: the square of the mean's error is .34 to .97 of what independent biases would give, both
-        directions alike (measured, as above). With (1, 0) places stated largest erred by .3 of that, the others by 1.25
-        times. Of two lights, one of which is right, error/stated of u and v together is 1 (derived).
+    bias_across
+        Fraction of the variance across a direction that is stated in it where no lights agree: an estimate from two or
+        three lights has few degrees of freedom. Without, places that were stated largest on raised droplets erred by .3
+        of that, others by 1.25 times (measured); with twice of it it fits as well.
     local_bias_range
-        Window (px) of a light's bias where it changes by more than chance within that window: a third of it. Of lights displaced
+        The same (px) where the bias changes by more than chance within that window: a third of it. Of lights displaced
         within discs of 18 to 50 px by .1 to 1 px (144 of them, at random places) errors are 1.2 times what is stated;
         with 12 px 1.9 times, with 5 px .72, and at rest .82 (measured).
     local_bias_threshold
@@ -222,7 +220,7 @@ class SolverConstants:
     prior_blocks: float = 0.1
     bias_range: float = 24.0
     bias_correlation_range: float = 34.0
-    bias_directions: tuple[float, float] = (0.5, 0.17)
+    bias_across: float = 0.25
     local_bias_range: float = 8.0
     local_bias_threshold: float = 8.0
 

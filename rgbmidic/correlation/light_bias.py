@@ -72,8 +72,9 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
     residual_variance = count / (count - 1) * (fractions[:, None] ** 2 * scatter).sum(axis=0)
     residual_variance += ((fractions - precision)[:, None] * local_change).sum(axis=0) ** 2
-    along, across = constants.bias_directions
-    residual_variance = along * residual_variance + across * residual_variance[::-1]
+    across = constants.bias_across
+    where_none_agree = 2 / (count + 1) * ((1 - across) * residual_variance + across * residual_variance[::-1])
+    residual_variance = consistency * residual_variance + (1 - consistency) * where_none_agree
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
