@@ -5,7 +5,8 @@ Noise makes some thousandths of a pixel of it; more is a reflection that does no
 the droplets' flanks. The solution is the mean of the lights by their precision, so it holds some of each light's bias.
 Where lights agree with each other (`rgbmidic.illumination.displacement.consensus_weights`) the others' part is taken
 off the solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose
-biases are independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
+biases are independent; where no lights agree, all are displaced, each to the side of its lamp, and the biases cancel in
+part. Of two lights that disagree nobody knows which is right.
 """
 
 from __future__ import annotations
