@@ -28,7 +28,15 @@ DISPUTED = 0.1
 
 
 class Status(IntEnum):
-    """Status of a frame."""
+    """Status of a frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rgbmidic import Status, correlate
+    >>> correlate(np.zeros((60, 60)), np.zeros((60, 60))).status is Status.FAILED
+    True
+    """
 
     CONVERGED = 0
     NOT_CONVERGED = 1
@@ -36,7 +44,16 @@ class Status(IntEnum):
 
 
 class NodeStatus(IntEnum):
-    """Status of a node."""
+    """Status of a node.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> result = Result.open("my_result")
+    >>> measured = result.node_status[1] == NodeStatus.MEASURED
+    >>> measured.shape == (len(result.nodes),)
+    True
+    """
 
     MEASURED = 0
     NOT_SEEN = 1
@@ -85,13 +102,24 @@ class Solution(HtmlRepr):
         Coefficients beta of the rigid functions of each light (0 for the first, NaN for a light that sees nothing):
         shift in x and y in px, then rotation in rad about the middle of the mesh.
     residual : ndarray, shape (k,), float64
-        Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
-        no weight.
+        Weighted rms of ``f - g(x + u)`` of each light, corrected for brightness, over the local mean of f; NaN where a
+        light has no weight.
     weight_fraction : ndarray, shape (k,), float64
         Mean over the pixels of the region of each light's fraction of the sum of the weights; adds up to the part of
         the region that any light sees.
     history : ndarray, shape (iterations,), float64
         Largest motion of a measured node in each iteration, px.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=40)
+    >>> solution.displacement.shape == solution.displacement_std.shape == (len(solution.nodes), 2)
+    True
+    >>> bool(solution.displacement_std[solution.measured].max() < 0.05)
+    True
     """
 
     nodes: FloatArray
@@ -244,6 +272,17 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     Returns
     -------
     Solution
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> speckle[25:55, 25:55] = np.nan
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=12)
+    >>> filled = fill(Tri3Mesh(nodes=solution.nodes, elements=solution.elements), solution, longest=40.0)
+    >>> np.isnan(solution.displacement).any(), np.isnan(filled.displacement).any()
+    (np.True_, np.False_)
     """
     measured = solution.measured
     if measured.all() or measured.sum() < 6:

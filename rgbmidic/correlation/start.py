@@ -1,12 +1,12 @@
 """Initial guesses of the displacement, however large the motion, and the tracking of one frame after another.
 
-A frame starts from the last one's displacement, and from a search where that fails. The search compares pictures of
-both states, reduced 8 times, then 4, 2 and 1 times. The lights' images are locally normalised (so that reflections and
-shading weigh little) and averaged into one picture per state. Its keypoints (SIFT: Lowe, Int. J. Comput. Vision 60,
-2004) are paired by their descriptors, which change little under shift, rotation and moderate strain. Angle and size of
-a pair give the turn and stretch of its surroundings; it counts if the pairs around it have moved accordingly. The nodes
-follow the pairs around them by a robust local affine fit. The confidence of such an initial guess is the fraction of
-the nodes around which the images then agree.
+A frame starts from the last one's displacement, and from a search where that fails or loses nodes. The search compares
+pictures of both states, reduced 8 times, then 4, 2 and, of small regions, 1 times. The lights' images are locally
+normalised (so that reflections and shading weigh little) and averaged into one picture per state. Its keypoints (SIFT:
+Lowe, Int. J. Comput. Vision 60, 2004) are paired by their descriptors, which change little under shift, rotation and
+moderate strain. Angle and size of a pair give the turn and stretch of its surroundings; it counts if the pairs around
+it have moved accordingly. The nodes follow the pairs around them by a robust local affine fit. The confidence of such
+an initial guess is the fraction of the nodes around which the images then agree.
 """
 
 from __future__ import annotations
@@ -78,10 +78,10 @@ class Search:
     ----------
     normalise
         Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
-        results differ by 4e-5 px at most (benchmarks/constants.py).
+        results differ by 5e-4 px at most, by more between two bodies and in a deep shadow (benchmarks/constants.py).
     flat
         Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
-        or twice of it results differ by 4e-6 px at most (benchmarks/constants.py).
+        or twice of it results differ by 2e-4 px at most, elsewhere as above (benchmarks/constants.py).
     grey
         Grey levels of the picture's local standard deviation: three of them fit into 8 bits.
     contrast
@@ -108,7 +108,7 @@ class Search:
         Most keypoints of the deformed image, where there are as many per area.
     context
         Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
-        differ by 2e-5 px at most (benchmarks/constants.py).
+        differ by 1.3e-3 px at most, elsewhere as above (benchmarks/constants.py).
     min_confidence
         Confidence from which an initial guess is worth a solve: another specimen gives at most .1
         (benchmarks/starts.py).
@@ -322,6 +322,18 @@ def find_initial_guess(reference: Reference, deformed: Deformed) -> InitialGuess
     -------
     InitialGuess
         The surest of `Search.candidates`; rest, with the confidence 0, where there is none.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> guess = find_initial_guess(reference, Deformed.prepare(np.roll(speckle, 3, axis=2)))
+    >>> guess.displacement.mean(axis=0).round()
+    array([3., 0.])
     """
     no_guess = InitialGuess(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
     return max(Search().candidates(reference, deformed), key=lambda guess: guess.confidence, default=no_guess)
@@ -373,6 +385,11 @@ class TrackingState:
         The frames that have become the reference in turn.
     best_match : float
         How well a frame has matched the last of them, see `ReferenceUpdate.match`; 0 where none has.
+
+    Examples
+    --------
+    >>> TrackingState(displacement=None).reference_updates
+    ()
     """
 
     displacement: FloatArray | None
@@ -436,6 +453,19 @@ def track(
     -------
     Solution
         The best of those from each initial guess.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> from rgbmidic.settings import SolverSettings
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> deformed, state = Deformed.prepare(np.roll(speckle, 3, axis=2)), TrackingState(displacement=None)
+    >>> track(reference, deformed, state, SolverSettings(), None).displacement.mean(axis=0).round(2).tolist()
+    [3.0, 0.0]
     """
     best: Solution | None = None
     surest = 0.0
