@@ -32,7 +32,7 @@ class Elimination:
 
     Attributes
     ----------
-    order : ndarray, shape (N,)
+    position : ndarray, shape (N,)
         When each node is eliminated. All else counts the nodes so.
     diagonal_slots : ndarray, shape (N, 2)
         Places of the entries xx and yy of each node's own block in the matrix' data.
@@ -44,7 +44,7 @@ class Elimination:
         The same by rows.
     """
 
-    order: Index
+    position: Index
     diagonal_slots: Index
     matrix_rows: tuple[Index, Index, Index]
     lower: sp.csc_matrix
@@ -68,20 +68,20 @@ class Elimination:
         values = np.where(row == column, edges[column] + 1.0, -1.0)
         graph = sp.csc_matrix((values, row, np.concatenate([[0], np.cumsum(edges)])), shape=(edges.size,) * 2)
         factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        factor, order = factors.L, factors.perm_c
+        factor, position = factors.L, factors.perm_c
         factor.sort_indices()
         below = np.ones(factor.nnz, dtype=bool)
         below[factor.indptr[:-1]] = False  # the diagonal is the first of each column
         rows, starts = factor.indices[below], np.concatenate([[0], np.cumsum(np.diff(factor.indptr) - 1)])
         lower = sp.csc_matrix((np.ones(rows.size, dtype=bool), rows, starts), shape=factor.shape)
-        half = np.flatnonzero(order[column] <= order[row])
-        half = half[np.argsort(order[row[half]], kind="stable")]
+        half = np.flatnonzero(position[column] <= position[row])
+        half = half[np.argsort(position[row[half]], kind="stable")]
         diagonal_slots = np.empty((edges.size, 2), dtype=np.int64)
-        diagonal_slots[order[row[row == column]]] = slots[row == column][:, [0, 1], [0, 1]]
-        row_starts = np.searchsorted(order[row[half]], np.arange(edges.size + 1))
-        matrix_rows = row_starts, order[column[half]], np.ascontiguousarray(slots[half])
+        diagonal_slots[position[row[row == column]]] = slots[row == column][:, [0, 1], [0, 1]]
+        row_starts = np.searchsorted(position[row[half]], np.arange(edges.size + 1))
+        matrix_rows = row_starts, position[column[half]], np.ascontiguousarray(slots[half])
         return cls(
-            order=order,
+            position=position,
             diagonal_slots=diagonal_slots,
             matrix_rows=matrix_rows,
             lower=lower,
@@ -101,7 +101,7 @@ class Elimination:
         LinAlgError
             The matrix is not positive definite, or singular in double precision.
         """
-        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.order.size, 3))
+        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.position.size, 3))
         structure = self.lower.indptr, self.lower.indices
         factorise(
             data, *self.matrix_rows, self.lower_by_rows.indptr, self.lower_by_rows.indices, *structure, lower, inverse
@@ -112,9 +112,9 @@ class Elimination:
             raise np.linalg.LinAlgError("the matrix is singular, or not positive definite")
 
         def solve(right_sides: FloatArray) -> FloatArray:
-            solution = np.empty((self.order.size, 2, right_sides[0].size))
-            solution[self.order] = right_sides.reshape(solution.shape)
+            solution = np.empty((self.position.size, 2, right_sides[0].size))
+            solution[self.position] = right_sides.reshape(solution.shape)
             solve_factors(*structure, lower, inverse, solution)
-            return solution[self.order].reshape(right_sides.shape)
+            return solution[self.position].reshape(right_sides.shape)
 
         return solve

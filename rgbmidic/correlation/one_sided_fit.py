@@ -55,6 +55,8 @@ class OneSidedConstants:
     unresolved
         Errors of displacement and of strain over their noise from which strain is called unresolved: with less a hole
         at rest is called so by chance (measured: 1 of 10 frames with 1 and 4).
+    negligible
+        Error of strain that is not reported, whatever the noise: a hundredth of a per mille. Chosen.
     min_nodes
         Number of nodes of which less are not spoken of. Chosen.
     """
@@ -67,6 +69,7 @@ class OneSidedConstants:
     departure_noise: float = 0.5
     significance: float = 2.5
     unresolved: tuple[float, float] = (1.3, 4.0)
+    negligible: float = 1e-5
     min_nodes: int = 3
 
 
@@ -316,6 +319,7 @@ def unresolved_strain(mesh: Tri3Mesh, solution: Solution, with_error: Solution) 
     if not np.isfinite(missed).any():
         noise, missed = before, np.sqrt(np.maximum(noise**2 - before**2, 0))
     is_large = missed > np.repeat(_CONSTANTS.unresolved, [2, 3]) * noise
+    is_large[:, 2:] &= missed[:, 2:] > _CONSTANTS.negligible
     unresolved = at_free_boundary(mesh) & is_large[:, :2].any(axis=1) & is_large[:, 2:].any(axis=1)
     if unresolved.sum() < _CONSTANTS.min_nodes:
         return ""

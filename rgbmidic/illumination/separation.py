@@ -113,7 +113,7 @@ def _separated(
     model = reconstruct(
         linear, crosstalk, registration=calibration.registration, texture=texture, mixing=mixing, tables=tables
     )
-    return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
+    return reconstructed_lights(model, crosstalk, are_lights=mixing is not None)
 
 
 @checked
@@ -159,7 +159,7 @@ def demosaic(
     return reconstruct(linear, crosstalk, texture=texture).channels
 
 
-def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed: bool = False) -> IlluminationImages:
+def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, are_lights: bool = False) -> IlluminationImages:
     """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels.
 
     The channels are unmixed, unless what the method gives are the lights already. The index, on the blocks' grid, is
@@ -179,7 +179,7 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed
         "texture": model.texture,
     }
     channels = model.channels
-    if not unmixed:
+    if not are_lights:
         return replace(unmix(channels, crosstalk), **diagnostics)
     return IlluminationImages(
         values=channels.values,

@@ -47,7 +47,7 @@ class FrameProgress:
         self._write_times = np.zeros(frames, dtype=np.int64)
 
     @property
-    def read_count(self) -> int:
+    def n_frames_read(self) -> int:
         """Number of frames that were read."""
         return int((self.status != _NOT_YET).sum())
 
@@ -69,7 +69,7 @@ class FrameProgress:
     def summary(self, finished: int) -> str:
         """State how many frames are `finished`, and how they ended."""
         texts = [f"{finished} of {len(self.status)} frames measured"]
-        texts += [] if self.read_count >= finished else [f"{self.read_count} looked through"]
+        texts += [] if self.n_frames_read >= finished else [f"{self.n_frames_read} looked through"]
         for code, outcome in ((1, "not converged"), (2, "failed"), (_DAMAGED, "damaged")):
             if count := int((self.status == code).sum()):
                 texts.append(f"{count} {outcome}")

@@ -513,7 +513,7 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
     result, progress = Result.open(tmp_path / "result", partial=True), FrameProgress(4)
     for _ in range(2):
         progress.advance(result)
-        assert progress.read_count == 3
+        assert progress.n_frames_read == 3
     assert progress.status.tolist() == [0, 2, 1, -1]
     np.testing.assert_allclose(progress.fraction[:3], [(r.node_status == 0).mean() for r in records])
     assert progress.summary(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
