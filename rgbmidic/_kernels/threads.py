@@ -227,5 +227,6 @@ def compiled(over: str | None = None, **options: Any) -> Callable[[Callable[...,
     return partial(Kernel, over=over, **always | options)
 
 
-helper = partial(compiled, no_cpython_wrapper=True)
-"""For a function that only kernels call."""
+helper = partial(compiled, no_cpython_wrapper=True, forceinline=True)
+"""For a function that only kernels call. It becomes a part of each: of one that stays a function, the kernel just compiled
+calls another copy than the kernel from the cache, and the last bits differ (measured)."""
