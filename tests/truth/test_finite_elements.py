@@ -18,8 +18,9 @@ from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
-from rgbmidic.results.result_in_units import ResultInUnits, placement_of
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import read_test
+from rgbmidic.tools.finite_elements import placement_of
 from rgbmidic.typing import FloatArray
 
 SHAPE, MIDDLE = (301, 301), 150.0

@@ -7,8 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.extensions import LIGHT_WEIGHTS, MESH_SOURCES, load_extension
+
 CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "results", "pipeline", "settings")
-TOOLS = ("typer", "rich", "bokeh", "matplotlib", *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view")))
+TOOLS = (
+    *("typer", "rich", "bokeh", "matplotlib"),
+    *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view", "tools.finite_elements")),
+)
 
 
 SLOW = ("scipy.signal", "scipy.stats", "scipy.optimize", "numba")
@@ -20,6 +28,17 @@ def test_the_core_is_imported_without_tools_and_slow_packages() -> None:
     code = f"import sys, {rooms}\nprint(*sorted(set({TOOLS + SLOW!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not done.stdout.split()
+
+
+def test_what_a_tool_adds_is_found_and_what_is_missing_is_named() -> None:
+    for table in (LIGHT_WEIGHTS, MESH_SOURCES):
+        assert all(callable(load_extension(table, name, "a key")) or hasattr(table[name](), "place") for name in table)
+    assert [*LIGHT_WEIGHTS] == ["geometry"]
+    assert [*MESH_SOURCES] == ["finite_elements"]
+    with pytest.raises(
+        ConfigurationError, match=r'mesh.file needs the tool that adds "finite_elements"; there are none'
+    ):
+        load_extension({}, "finite_elements", "mesh.file")
 
 
 ROOT = Path(__file__).resolve().parents[2]

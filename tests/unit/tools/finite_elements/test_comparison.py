@@ -11,15 +11,15 @@ import pytest
 from nodal_tests import MESH, nodal_noise
 from results import make_result
 
-from rgbmidic import cli
+from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, cli, read_mesh
 from rgbmidic.command import execute
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
-from rgbmidic.results.comparison import Comparison, measured_mesh
-from rgbmidic.results.simulation import Levelling, Simulation, find_placement
+from rgbmidic.tools.finite_elements import measured_mesh
+from rgbmidic.tools.finite_elements.comparison import Comparison
+from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, find_placement
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
