@@ -2,7 +2,7 @@
 
 from rgbmidic.mesh.pixel_map import PixelMap
 from rgbmidic.mesh.region import Region
-from rgbmidic.mesh.source import MeshLabels, MeshSource, Plane
+from rgbmidic.mesh.source import MeshLabels, MeshSource
 from rgbmidic.mesh.tri3 import Tri3Mesh
 
-__all__ = ["MeshLabels", "MeshSource", "PixelMap", "Plane", "Region", "Tri3Mesh"]
+__all__ = ["MeshLabels", "MeshSource", "PixelMap", "Region", "Tri3Mesh"]

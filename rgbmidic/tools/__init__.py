@@ -24,6 +24,6 @@ def _geometry_weights() -> PrepareWeights:
 
 
 def _finite_elements() -> MeshSource:
-    from rgbmidic.tools.finite_elements import MeshFile
+    from rgbmidic.tools.finite_elements.mesh_source import MeshFile
 
     return MeshFile()

@@ -2,7 +2,7 @@
 
 from rgbmidic.tools.finite_elements.files import read_mesh
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
-from rgbmidic.tools.finite_elements.mesh_source import MeshFile, measured_mesh, placement_of
+from rgbmidic.tools.finite_elements.mesh_source import measured_mesh, placement_of
 from rgbmidic.tools.finite_elements.placement import Placement
 
-__all__ = ["FiniteElementMesh", "MeshFile", "Placement", "measured_mesh", "placement_of", "read_mesh"]
+__all__ = ["FiniteElementMesh", "Placement", "measured_mesh", "placement_of", "read_mesh"]

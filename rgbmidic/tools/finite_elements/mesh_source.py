@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.frames import file_hash
-from rgbmidic.mesh import MeshLabels, Plane, Region, Tri3Mesh
+from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
+from rgbmidic.mesh.source import Plane
 from rgbmidic.results.result_in_units import stored_camera
 from rgbmidic.settings import MeshSettings
 from rgbmidic.tools.finite_elements.files import read_mesh
@@ -35,24 +36,28 @@ class MeshFile:
         logger.info("mesh.points: %s", placement.summary())
         whole_mesh = read_mesh(settings.file, unit=settings.unit or "mm", part=settings.part)
         fe_mesh, mesh, covered = place_on_image(whole_mesh, placement, region.mask.shape, region)
-        document = {
-            **{key: getattr(fe_mesh, key) for key in ("name", "axes", "unit_mm", "numbering")},
-            "sha256": file_hash(Path(fe_mesh.name)),
-            "placement": placement.to_document(),
-        }
-        labels = MeshLabels(
-            name=fe_mesh.name,
-            node_number=fe_mesh.node_numbers,
-            element_number=fe_mesh.element_numbers,
-            node_mm=fe_mesh.points,
-            document=document,
-        )
-        return mesh, covered, labels
+        return mesh, covered, labels_of(fe_mesh, placement)
 
     def scale(self, document: Mapping[str, Any]) -> tuple[float | None, float]:
         """Return the mm per px of the placement, and its standard uncertainty."""
         placement = Placement.from_document(document["placement"])
         return placement.mm_per_pixel, placement.mm_per_pixel_std
+
+
+def labels_of(fe_mesh: FiniteElementMesh, placement: Placement) -> MeshLabels:
+    """Return what a result keeps of the mesh of a file and of where it lies on the image."""
+    document = {
+        **{key: getattr(fe_mesh, key) for key in ("name", "axes", "unit_mm", "numbering")},
+        "sha256": file_hash(Path(fe_mesh.name)),
+        "placement": placement.to_document(),
+    }
+    return MeshLabels(
+        name=fe_mesh.name,
+        node_number=fe_mesh.node_numbers,
+        element_number=fe_mesh.element_numbers,
+        node_mm=fe_mesh.points,
+        document=document,
+    )
 
 
 def placement_of(result: Result) -> Placement | None:
@@ -79,6 +84,15 @@ def placement_of(result: Result) -> Placement | None:
 
 def measured_mesh(result: Result) -> FiniteElementMesh | None:
     """Return the part of ``mesh.file`` that a result was measured on; None where it has none.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    FiniteElementMesh or None
 
     Examples
     --------

@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh import Plane, Region, Tri3Mesh
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.source import Plane
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
 from rgbmidic.typing import FloatArray, as_numbers
