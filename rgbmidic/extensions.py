@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from rgbmidic.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from rgbmidic.fields import Probe
     from rgbmidic.mesh import MeshSource
     from rgbmidic.weights.light_weights import PrepareWeights
 
@@ -21,6 +22,9 @@ LIGHT_WEIGHTS: dict[str, Callable[[], PrepareWeights]] = {}
 """Methods of weighting by the name of ``weights.method``."""
 MESH_SOURCES: dict[str, Callable[[], MeshSource]] = {}
 """Meshes of other origin, by the name under which a result keeps their document; ``mesh.file`` is "finite_elements"."""
+
+PROBES: dict[str, Callable[[], Callable[..., Probe]]] = {}
+"""Probes by their kind; called as those of `rgbmidic.fields` are, with the `settings` and `units` beside."""
 
 
 def load_extension(table: Mapping[str, Callable[[], T]], name: str, key: str) -> T:

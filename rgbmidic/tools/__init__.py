@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 from rgbmidic import extensions
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rgbmidic.fields import Probe
     from rgbmidic.mesh import MeshSource
     from rgbmidic.weights.light_weights import PrepareWeights
 
@@ -15,6 +18,7 @@ def add_to_core() -> None:
     """Add to the core what a TEST.toml may name of a tool, which is imported when a test needs it."""
     extensions.LIGHT_WEIGHTS["geometry"] = _geometry_weights
     extensions.MESH_SOURCES["finite_elements"] = _finite_elements
+    extensions.PROBES["tip"] = _crack_tip
 
 
 def _geometry_weights() -> PrepareWeights:
@@ -27,3 +31,9 @@ def _finite_elements() -> MeshSource:
     from rgbmidic.tools.finite_elements.mesh_source import MeshFile
 
     return MeshFile()
+
+
+def _crack_tip() -> Callable[..., Probe]:
+    from rgbmidic.tools.finite_elements.crack_tip import tip_probe
+
+    return tip_probe

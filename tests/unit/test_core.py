@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.extensions import LIGHT_WEIGHTS, MESH_SOURCES, load_extension
+from rgbmidic.extensions import LIGHT_WEIGHTS, MESH_SOURCES, PROBES, load_extension
 
 CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "results", "pipeline", "settings")
 TOOLS = (
@@ -31,10 +31,9 @@ def test_the_core_is_imported_without_tools_and_slow_packages() -> None:
 
 
 def test_what_a_tool_adds_is_found_and_what_is_missing_is_named() -> None:
-    for table in (LIGHT_WEIGHTS, MESH_SOURCES):
-        assert all(callable(load_extension(table, name, "a key")) or hasattr(table[name](), "place") for name in table)
-    assert [*LIGHT_WEIGHTS] == ["geometry"]
-    assert [*MESH_SOURCES] == ["finite_elements"]
+    assert callable(load_extension(LIGHT_WEIGHTS, "geometry", "weights.method"))
+    assert callable(load_extension(MESH_SOURCES, "finite_elements", "mesh.file").place)
+    assert callable(load_extension(PROBES, "tip", "probes.tips"))
     with pytest.raises(
         ConfigurationError, match=r'mesh.file needs the tool that adds "finite_elements"; there are none'
     ):
