@@ -123,9 +123,9 @@ def compare(
     Page, tables and the fields at the simulation's nodes are written into a folder.
     """
     from rgbmidic.lab import check_folder
-    from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.tools.finite_elements import measured_mesh, read_mesh
     from rgbmidic.tools.finite_elements.comparison import Comparison
+    from rgbmidic.tools.finite_elements.comparison_page import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.tools.finite_elements.simulation import Simulation, find_placement
 
     if rigid not in ("tell", "remove"):

@@ -15,10 +15,10 @@ from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, cli, read_m
 from rgbmidic.command import execute
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.tools.finite_elements import measured_mesh
 from rgbmidic.tools.finite_elements.comparison import Comparison
+from rgbmidic.tools.finite_elements.comparison_page import scale_text
 from rgbmidic.tools.finite_elements.mesh_source import labels_of
 from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, find_placement
 

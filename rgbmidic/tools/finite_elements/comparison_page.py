@@ -303,6 +303,7 @@ def _page(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) 
     ]
     return render(
         "comparison.html",
+        Path(__file__).parent,
         comparison=comparison,
         frame_comparisons=frame_comparisons,
         simulation=Path(comparison.simulation.name).name,
