@@ -470,7 +470,7 @@ def _noise_residual(reference: Reference, noise: FloatImage, field: FloatArray) 
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
     return Residual(
         reference=reference,
-        brightness=reference.brightness_of(weights, np.zeros((len(noise), 1, 6))),
+        brightness=reference.brightness_of(weights, np.zeros((len(noise), 1, 6)), np.zeros(len(noise), dtype=bool)),
         weights=weights,
         difference=difference,
         moments=moments,

@@ -339,7 +339,7 @@ def _separate() -> None:
     from rgbmidic.lab.virtual.rendering import sphere_scene
     from rgbmidic.scene.scene import DatasetSettings
 
-    scene, settings = sphere_scene(size=_SIZE), DatasetSettings()
+    scene, settings = sphere_scene(size=_SIZE, lateral_colour=0.5), DatasetSettings()
     with tempfile.TemporaryDirectory() as folder:
         for index in range(2):
             frame = record(_images(index), scene.camera, scene.lights, seed=index)
