@@ -41,6 +41,20 @@ class MeshLabels:
         Positions of the nodes in mm, in the mesh's own axes.
     document : mapping
         Plain values for the provenance, from which the source states the scale.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> corners = np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 5.0]])
+    >>> labels = MeshLabels(
+    ...     name="plate.inp",
+    ...     node_number=np.array([11, 12, 17]),
+    ...     element_number=np.array([4]),
+    ...     node_mm=corners,
+    ...     document={},
+    ... )
+    >>> labels.node_number.tolist()
+    [11, 12, 17]
     """
 
     name: str
@@ -51,7 +65,16 @@ class MeshLabels:
 
 
 class MeshSource(Protocol):
-    """The mesh of a test, in place of the one that is made of its region (`rgbmidic.extensions.MESH_SOURCES`)."""
+    """The mesh of a test, in place of the one that is made of its region (`rgbmidic.extensions.MESH_SOURCES`).
+
+    Examples
+    --------
+    >>> from rgbmidic.extensions import MESH_SOURCES
+    >>> source: MeshSource = MESH_SOURCES["finite_elements"]()
+    >>> pairs = [[0, 0, 0, 100], [10, 0, 40, 100]]
+    >>> source.scale({"placement": {"matrix": [[4, 0], [0, -4]], "shift": [0, 100], "pairs": pairs}})
+    (0.25, 0.0)
+    """
 
     def place(
         self, settings: MeshSettings, region: Region, camera: Plane | None
