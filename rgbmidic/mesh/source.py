@@ -72,8 +72,9 @@ class MeshSource(Protocol):
     >>> from rgbmidic.extensions import MESH_SOURCES
     >>> source: MeshSource = MESH_SOURCES["finite_elements"]()
     >>> pairs = [[0, 0, 0, 100], [10, 0, 40, 100]]
-    >>> source.scale({"placement": {"matrix": [[4, 0], [0, -4]], "shift": [0, 100], "pairs": pairs}})
-    (0.25, 0.0)
+    >>> document = {"placement": {"matrix": [[4, 0], [0, -4]], "shift": [0, 100], "pairs": pairs}}
+    >>> [round(number, 6) for number in source.scale(document)]
+    [0.25, 0.0]
     """
 
     def place(
