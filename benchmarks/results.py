@@ -28,7 +28,8 @@ from plate_fe import compared_plates
 from textures import Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate, measure_sequence
-from rgbmidic.fields import crack_jump, strain_of, stress_intensity
+from rgbmidic.fields import crack_jump, strain_of
+from rgbmidic.tools.finite_elements import stress_intensity
 
 from .tables import table
 

@@ -17,13 +17,17 @@ if TYPE_CHECKING:
     from rgbmidic.illumination import separate
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
-    from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+    from rgbmidic.mesh import Region, Tri3Mesh
     from rgbmidic.pipeline import correlate, measure, measure_sequence
     from rgbmidic.results import Result, export_result
     from rgbmidic.results.histories import read_histories
     from rgbmidic.settings import SolverSettings, TestSettings, read_test
+    from rgbmidic.tools.finite_elements import FiniteElementMesh, Placement, read_mesh
 
 from rgbmidic._version import __version__
+from rgbmidic.tools import add_to_core as _add_tools_to_core
+
+_add_tools_to_core()
 
 __all__ = [
     "Calibration",
@@ -62,11 +66,12 @@ _HOMES = {
     "illumination": ("separate",),
     "illumination.calibration": ("Calibration",),
     "lab.inspection": ("Inspection", "inspect_frame"),
-    "mesh": ("FiniteElementMesh", "Placement", "Region", "Tri3Mesh", "read_mesh"),
+    "mesh": ("Region", "Tri3Mesh"),
     "pipeline": ("correlate", "measure", "measure_sequence"),
     "results": ("Result", "export_result"),
     "results.histories": ("read_histories",),
     "settings": ("SolverSettings", "TestSettings", "read_test"),
+    "tools.finite_elements": ("FiniteElementMesh", "Placement", "read_mesh"),
 }
 
 

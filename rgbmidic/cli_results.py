@@ -123,10 +123,10 @@ def compare(
     Page, tables and the fields at the simulation's nodes are written into a folder.
     """
     from rgbmidic.lab import check_folder
-    from rgbmidic.mesh import read_mesh
-    from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
-    from rgbmidic.results.comparison import Comparison, measured_mesh
-    from rgbmidic.results.simulation import Simulation, find_placement
+    from rgbmidic.tools.finite_elements import measured_mesh, read_mesh
+    from rgbmidic.tools.finite_elements.comparison import Comparison
+    from rgbmidic.tools.finite_elements.comparison_page import PAGE, comparison_files, scale_text, write_comparison
+    from rgbmidic.tools.finite_elements.simulation import Simulation, find_placement
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')

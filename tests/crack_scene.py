@@ -6,8 +6,9 @@ import numpy as np
 from textures import Texture
 
 from rgbmidic import correlate
-from rgbmidic.fields import Nodal, Units, Williams
-from rgbmidic.fields.crack_tip import williams_series
+from rgbmidic.fields import Nodal, Units
+from rgbmidic.tools.finite_elements import Williams
+from rgbmidic.tools.finite_elements.crack_tip import williams_series
 
 SHAPE = (240, 320)
 REGION = (10, 10, 309, 229)

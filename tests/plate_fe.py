@@ -13,12 +13,11 @@ from results import make_result
 from scipy.sparse.linalg import spsolve
 from textures import Texture
 
-from rgbmidic import correlate
+from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, correlate
 from rgbmidic.fields.interpolation import MeshPoints
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.comparison import Comparison, FrameComparison
-from rgbmidic.results.simulation import Simulation
+from rgbmidic.tools.finite_elements.comparison import Comparison, FrameComparison
+from rgbmidic.tools.finite_elements.simulation import Simulation
 from rgbmidic.typing import FloatArray
 
 SHAPE, MM_PER_PIXEL = (210, 190), 0.05

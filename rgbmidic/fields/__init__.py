@@ -1,6 +1,5 @@
 """From a solution to what an engineer reads: the field at pixels and nodes, strain, rates, units, probes."""
 
-from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
 from rgbmidic.fields.interpolation import MeshPoints, at_nodes, at_pixels, field_rms
@@ -31,9 +30,7 @@ __all__ = [
     "RigidMotion",
     "Strain",
     "StrainGauges",
-    "StressIntensity",
     "Units",
-    "Williams",
     "at_nodes",
     "at_pixels",
     "crack_jump",
@@ -49,7 +46,6 @@ __all__ = [
     "shortest_gauge",
     "strain_of",
     "strain_of_gradient",
-    "stress_intensity",
 ]
 
 __getattr__ = refuse_old_names(__name__)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic import extensions
 from rgbmidic.errors import InputError
-from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
 from rgbmidic.fields.interpolation import MeshPoints, PointSum
@@ -412,7 +412,7 @@ class Area(Mean):
         return [*displacements, *_strain_histories(self.name, strain, displacements[0].note)]
 
 
-PROBES: dict[str, tuple[int, int, Callable[..., Probe]]] = {
+PROBES: dict[str, tuple[int, int, Callable[..., Probe] | None]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
     "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.min_fraction)),
     "circle": (1, 1, lambda c, name, *place, **more: Area(c, name, _circle(*place), **more)),
@@ -421,13 +421,11 @@ PROBES: dict[str, tuple[int, int, Callable[..., Probe]]] = {
     "straight_gauge": (2, 0, partial(Gauge, moving=False)),
     "strain_gauge": (1, 1, StrainGauge),
     "crack": (2, 0, JumpAlong),
-    "tip": (1, 2, CrackTip),
+    "tip": (1, 2, None),
 }
-"""Every kind of probe with how many points and lengths (px) place it, and what makes it."""
+"""Kinds of probes with how many points and lengths (px) place them, and what makes them; None: a tool."""
 _STRAINED = ("circle", "region", "strain_gauge")
 """Those that measure a strain of a stated measure."""
-_OF_TIPS = ("youngs_modulus", "poissons_ratio", "plane", "terms", "fit_tip")
-"""Settings of a crack's tip, which [probes] with tips checks, as `Williams` takes them."""
 
 
 def make_probe(
@@ -479,9 +477,9 @@ def make_probe(
     if len(coordinates) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(coordinates)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}
-    if kind == "tip":
-        tip_settings: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
-        more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **tip_settings)
+    if make is None:
+        make = extensions.load_extension(extensions.PROBES, kind, f"probes.{kind}s")
+        more = {"settings": settings, "units": Units() if rectified is None else rectified.units}
     rectified_coordinates = np.asarray(
         coordinates if rectified is None else rectified.probe_coordinates(coordinates, points), dtype=np.float64
     )

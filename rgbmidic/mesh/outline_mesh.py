@@ -16,8 +16,8 @@ import scipy.sparse as sp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import cross
 from rgbmidic.mesh.region import MAX_COORDINATE
+from rgbmidic.mesh.triangles import cross
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0]])

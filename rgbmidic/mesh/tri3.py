@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import orient_elements
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
+from rgbmidic.mesh.triangles import orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 

@@ -23,7 +23,7 @@ from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.mosaic_model import BLOCK
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.illumination.texture import speckle_diameter
-from rgbmidic.mesh import FiniteElementMesh, Region, Tri3Mesh
+from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
@@ -102,8 +102,8 @@ def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]
     return dict(zip(images.names, medians, strict=True))
 
 
-def warn_small_elements(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
-    """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
+def warn_small_elements(mesh: Tri3Mesh, speckle: float | None, labels: MeshLabels) -> None:
+    """Warn of elements of a mesh that are small for the speckle, with the uncertainty to expect.
 
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.nodal_variance_factor`).
     """
@@ -115,11 +115,11 @@ def warn_small_elements(mesh: Tri3Mesh, speckle: float | None, finite_elements: 
     typical = float(np.median(sides[small]))
     text = (
         f"{int(small.sum())} of {sides.size} triangles have sides under {SPECKLES:g} speckles of {speckle:.1f} px, "
-        f"{typical:.1f} px in the median (element {finite_elements.element_numbers[smallest]}: {sides[smallest]:.1f} "
+        f"{typical:.1f} px in the median (element {labels.element_number[smallest]}: {sides[smallest]:.1f} "
         f"px): expect {min_side / typical:.1f} times ({min_side / sides[smallest]:.1f} times) the uncertainty of "
         f"elements of {SPECKLES:g} speckles; with fewer than {SUITABILITY.enough:g} nodes are lost"
     )
-    logger.warning("%s: %s", finite_elements.name, text)
+    logger.warning("%s: %s", labels.name, text)
 
 
 def _middle(inside: BoolArray, side: int = 256) -> tuple[slice, slice]:

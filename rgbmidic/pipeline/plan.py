@@ -20,6 +20,7 @@ from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
+from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
@@ -35,11 +36,11 @@ from rgbmidic.illumination.separation import (
     light_images,
     reference_images,
 )
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.placement import place_on_image
+from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
 from rgbmidic.pipeline.user_objects import check_user_objects
+from rgbmidic.results.quantities import MESH_DOCUMENT
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -112,8 +113,8 @@ class Plan:
         Side of the elements, px.
     window
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
-    finite_elements, placement
-        The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
+    labels
+        Of the nodes and elements of the mesh of ``mesh.file``; None: there is no file.
     notes
         For the provenance: figures of the calibration (`Calibration.figures`), why the elements have their size where
         ``mesh.element_size`` is ``"auto"``, in which frame and how far the mesh was refined (``mesh.refine``).
@@ -147,8 +148,7 @@ class Plan:
     exposure: float
     window: Window
     element_size: float
-    finite_elements: FiniteElementMesh | None = None
-    placement: Placement | None = None
+    labels: MeshLabels | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
     timings: bool = False
     process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
@@ -204,9 +204,9 @@ class Plan:
             plane.check_light(None if calibration is None else calibration.registration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         has_objects = any(item is not None for item in (source, weights, mesh, region))
-        finite_elements, placement = None, None
+        labels = None
         if settings.mesh.file is not None:
-            finite_elements, placement, mesh, region = finite_elements_of(settings, frame)
+            mesh, region, labels = place_mesh(settings, frame)
         region, window = region or read_region(settings.region, frame), Window.of_frame(frame)
         if not has_objects and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
@@ -243,8 +243,7 @@ class Plan:
             exposure=1e-9 * (series.recording.exposure_ns or 0),
             window=window,
             element_size=size,
-            finite_elements=finite_elements,
-            placement=placement,
+            labels=labels,
             notes={"calibration_figures": camera.figures() if camera else {}},
         )
         _check_reference(plan, state, calibration.noise if calibration else None)
@@ -397,8 +396,8 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
             f"{weights.blur:g} px, exceeds {max_level:.2g} of the dynamic range in the region. State a lower one, or "
             'weights.method = "statistics"'
         )
-    if plan.finite_elements is not None:
-        frame_quality.warn_small_elements(plan.reference.mesh, plan.speckle, plan.finite_elements)
+    if plan.labels is not None:
+        frame_quality.warn_small_elements(plan.reference.mesh, plan.speckle, plan.labels)
     elif small := frame_quality.too_small(plan.element_size, plan.speckle, frame_quality.SUITABILITY.hardly_enough):
         logger.warning("%s", small)
     if not plan.reference.pixel_weights.any():
@@ -425,17 +424,11 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
         )
 
 
-def finite_elements_of(
-    settings: TestSettings, frame: tuple[int, int]
-) -> tuple[FiniteElementMesh, Placement, Tri3Mesh, Region]:
-    """The part of ``mesh.file`` that is measured, where it lies on frames of this shape, and its pixels."""
-    assert settings.mesh.file is not None
+def place_mesh(settings: TestSettings, frame: tuple[int, int]) -> tuple[Tri3Mesh, Region, MeshLabels]:
+    """Return the mesh of ``mesh.file`` in px of frames of this shape, the pixels that it covers, and its labels."""
     camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
-    placement = Placement.fit(settings.mesh.points or (), camera)
-    logger.info("mesh.points: %s", placement.summary())
-    whole_mesh = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    measured_mesh, mesh, region = place_on_image(whole_mesh, placement, frame, read_region(settings.region, frame))
-    return measured_mesh, placement, mesh, region
+    source = load_extension(MESH_SOURCES, MESH_DOCUMENT, "mesh.file")
+    return source.place(settings.mesh, read_region(settings.region, frame), camera)
 
 
 def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int, int]) -> Window:

@@ -14,7 +14,7 @@ from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME
 from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.records import FrameRecord
 from rgbmidic.results.result import Result, finish_result
-from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, placement_of
+from rgbmidic.results.result_in_units import common_variance_fraction, frame_times
 from rgbmidic.results.store import ResultStore
 
 __all__ = [
@@ -39,7 +39,6 @@ __all__ = [
     "finish_result",
     "frame_times",
     "history_rows",
-    "placement_of",
     "read_profile",
     "speckle_diameter",
     "write_histories",

@@ -26,7 +26,7 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
-from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED
+from rgbmidic.results.quantities import FAILED, MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
@@ -257,8 +257,8 @@ def export_result(
 def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
     result = physical.result
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        finite_element_names = FINITE_ELEMENTS if result.node_number is not None else ()
-        for name in ("nodes", "elements", "names", "lights", *finite_element_names):
+        label_names = MESH_LABELS if result.node_number is not None else ()
+        for name in ("nodes", "elements", "names", "lights", *label_names):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
         times = frame_times(result, physical.scale)

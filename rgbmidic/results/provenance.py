@@ -21,9 +21,9 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import AnotherTestError, ResultError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
-from rgbmidic.mesh import FiniteElementMesh, Placement
+from rgbmidic.mesh import MeshLabels
 from rgbmidic.results.files import read_json
-from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED
+from rgbmidic.results.quantities import MESH_DOCUMENT, MESH_LABELS, SHARED
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray
 
@@ -52,8 +52,8 @@ class Origin:
         The mesh: (N, 2) positions in px and (E, 3) node indices.
     readers
         Names of the packages, beside those that every result needs, by which the frames are read.
-    finite_elements, placement
-        The same mesh in mm with the numbers of its nodes and elements, and where it lies; None: it is of no file.
+    labels
+        Numbers of its nodes and elements and positions in mm, where it is of a source that has them; None: it is not.
     names, lights
         Name of each frame and of each light.
     settings
@@ -81,19 +81,17 @@ class Origin:
     settings: TestSettings | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
     readers: Sequence[str] = ()
-    finite_elements: FiniteElementMesh | None = None
-    placement: Placement | None = None
+    labels: MeshLabels | None = None
     references: Sequence[int] = (0,)
     reference: npt.ArrayLike | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def mesh(self) -> dict[str, AnyArray]:
-        """`nodes` and `elements`, and what is known of finite elements, in the types of the table."""
+        """`nodes` and `elements`, and their labels, in the types of the table."""
         arrays: dict[str, npt.ArrayLike] = {"nodes": self.nodes, "elements": self.elements}
-        if (fe_mesh := self.finite_elements) is not None:
-            numbers = fe_mesh.node_numbers, fe_mesh.element_numbers, fe_mesh.points
-            arrays |= zip(FINITE_ELEMENTS, numbers, strict=True)
+        if self.labels is not None:
+            arrays |= {name: getattr(self.labels, name) for name in MESH_LABELS}
         return {name: SHARED[name].convert(array, {}) for name, array in arrays.items()}
 
     def provenance(self) -> dict[str, Any]:
@@ -116,12 +114,8 @@ class Origin:
                 document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
             if (file := self.settings.scale.camera) is not None:
                 document["camera"] = CameraCalibration.read(file).to_document()
-        if self.finite_elements is not None and self.placement is not None:
-            document["finite_elements"] = {
-                **{key: getattr(self.finite_elements, key) for key in ("name", "axes", "unit_mm", "numbering")},
-                "sha256": file_hash(Path(self.finite_elements.name)),
-                "placement": self.placement.to_document(),
-            }
+        if self.labels is not None:
+            document[MESH_DOCUMENT] = dict(self.labels.document)
         document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
         document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
         document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}
@@ -172,7 +166,7 @@ def _compared_entries(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "the calibration", document.get("calibration", {}).get("sha256")
     yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
     yield "the mesh", document["mesh"]
-    yield "the mesh's file", document.get("finite_elements", {}).get("sha256")
+    yield "the mesh's file", document.get(MESH_DOCUMENT, {}).get("sha256")
     yield "the number of frames", document["frames"]["count"]
     yield "the list of frames", document["frames"]["sha256"]
     yield from ((name, document[name]) for name in ("lights", "references"))

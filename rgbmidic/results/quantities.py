@@ -129,8 +129,10 @@ SHARED: dict[str, ResultQuantity] = {
 }
 """Quantities that all frames have in common."""
 
-FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
+MESH_LABELS = ("node_number", "element_number", "node_mm")
 """Those of them that only a mesh of ``mesh.file`` has."""
+MESH_DOCUMENT = "finite_elements"
+"""Name of its entry in the provenance, and of the source that wrote it."""
 
 UV = ("u", "v")
 DERIVED = {

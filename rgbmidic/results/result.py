@@ -25,7 +25,7 @@ from rgbmidic.results.provenance import (
     read_provenance,
     with_checksum,
 )
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
+from rgbmidic.results.quantities import MESH_DOCUMENT, MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.records import FrameRecord, FrameTable, QuantityAttributes
 from rgbmidic.results.warnings import join_frame_warnings
 from rgbmidic.settings import read_section
@@ -460,7 +460,7 @@ def list_frames(frames: Sequence[int], names: Sequence[str], max_count: int = 5)
 
 
 def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Read ``names`` of the frames, ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
+    """Read ``names`` of the frames, ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `MESH_LABELS`.
 
     Raises
     ------
@@ -474,7 +474,7 @@ def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
     texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
         raise ResultError(f"{path / NAMES} is damaged: it does not hold the names of the frames")
-    mesh_file_names = FINITE_ELEMENTS if "finite_elements" in provenance else ()
+    mesh_file_names = MESH_LABELS if MESH_DOCUMENT in provenance else ()
     mesh = _read_converted(path / MESH, ["nodes", "elements", *mesh_file_names], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / MESH} is damaged or of another result")

@@ -16,12 +16,13 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
-from rgbmidic.mesh import Placement, Tri3Mesh
-from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results.quantities import ELEMENT_STRAIN, MESH_DOCUMENT, QUANTITIES, STRAIN, UNKNOWN_TIME
 from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
@@ -60,7 +61,7 @@ def rectification_of(
     if effective_scale.unit == "px":
         effective_scale = replace(effective_scale, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
     elif scale is None:
-        camera = _stored_camera(result)
+        camera = stored_camera(result)
     elif scale.camera is not None:
         camera = CameraCalibration.read(scale.camera)
     if camera is not None:
@@ -68,42 +69,22 @@ def rectification_of(
     elif (
         effective_scale.unit == "mm"
         and effective_scale.mm_per_pixel is None
-        and (placement := placement_of(result)) is not None
+        and "camera" not in result.provenance
+        and (document := result.provenance.get(MESH_DOCUMENT)) is not None
     ):
-        effective_scale = replace(
-            effective_scale, mm_per_pixel=placement.mm_per_pixel, mm_per_pixel_std=placement.mm_per_pixel_std
-        )
+        mm_per_pixel, std = load_extension(MESH_SOURCES, MESH_DOCUMENT, "the mesh of the result").scale(document)
+        effective_scale = replace(effective_scale, mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
     return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), effective_scale, camera)
 
 
-def _stored_camera(result: Result) -> CameraCalibration | None:
+def stored_camera(result: Result) -> CameraCalibration | None:
+    """Return the camera that the ``[scale]`` of a result names, as its provenance holds it; None: none."""
     document = result.provenance.get("camera")
     return (
         None
         if document is None
         else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
     )
-
-
-def placement_of(result: Result) -> Placement | None:
-    """Return where the mesh of ``mesh.file`` lies on the image; None where the result has none.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    Placement or None
-
-    Examples
-    --------
-    >>> placement_of(Result.open("my_result")) is None  # its mesh is of no file
-    True
-    """
-    document = result.provenance.get("finite_elements")
-    return None if document is None else Placement.from_document(document["placement"], _stored_camera(result))
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:

@@ -17,7 +17,7 @@ from bokeh.models import ColumnDataSource
 
 from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.plan import finite_elements_of, read_region
+from rgbmidic.pipeline.plan import place_mesh, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
@@ -191,7 +191,7 @@ class SetupPage:
         if self.draft.section("mesh").get("file"):
             document = {**self.draft.document, "region": content or self.draft.section("region")}
             settings = TestSettings.from_mapping(document, self.draft.file.parent)
-            _, _, mesh, region = finite_elements_of(settings, self.source.shape)
+            mesh, region, _ = place_mesh(settings, self.source.shape)
             return mesh, region, mesh.size
         if content is None or not size:
             return None

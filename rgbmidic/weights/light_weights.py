@@ -10,7 +10,6 @@ precision around each pixel is a factor on that in the next one.
 from __future__ import annotations
 
 import hashlib
-import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -26,6 +25,7 @@ from rgbmidic.correlation.images import WINDOW, SlidingWindow, unmasked
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.uncertainty import design_effect
 from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.extensions import LIGHT_WEIGHTS, load_extension
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
@@ -290,11 +290,14 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
 
 
-METHODS_OF_TOOLS = {"geometry": "rgbmidic.scene.geometry_weights:GeometryWeights.prepare"}
-"""Methods that stand on a tool above the core, named as entry points are: a test that states one loads it.
+class PrepareWeights(Protocol):
+    """A method of weighting that a tool adds (`rgbmidic.extensions.LIGHT_WEIGHTS`)."""
 
-Called with the settings, the names of the lights, the shape (H, W) of the frames and their number.
-"""
+    def __call__(
+        self, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int
+    ) -> LightWeights:
+        """Return the weights of a test, for the names of its lights and the shape (H, W) and number of its frames."""
+        ...
 
 
 def prepare_weights(
@@ -345,9 +348,6 @@ def prepare_weights(
     """
     weights = settings.weights
     frame = shape or reference.shape
-    if weights.method in METHODS_OF_TOOLS:
-        prepare = pkgutil.resolve_name(METHODS_OF_TOOLS[weights.method])
-        return prepare(settings, lights=reference.names, shape=frame, frames=frames)  # type: ignore[no-any-return]
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
         mask_values = np.asarray(masks.masks)
@@ -358,11 +358,14 @@ def prepare_weights(
                 f"{_size(mask_values)} px"
             )
         return masks
-    if weights.method != "threshold":
+    if weights.method == "threshold":
+        if weights.threshold == "auto":
+            return automatic_weights(settings, reference, region, frames=frames, images_of=images_of)
+        return ThresholdWeights(threshold=weights.threshold, blur=weights.blur)
+    if weights.method in ("statistics", "none"):
         return Statistics() if weights.method == "statistics" else ValidPixels()
-    if weights.threshold == "auto":
-        return automatic_weights(settings, reference, region, frames=frames, images_of=images_of)
-    return ThresholdWeights(threshold=weights.threshold, blur=weights.blur)
+    prepare = load_extension(LIGHT_WEIGHTS, weights.method, "weights.method")
+    return prepare(settings, lights=reference.names, shape=frame, frames=frames)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plate_fe import compared_plates
 
-from rgbmidic.results.comparison import FrameComparison
+from rgbmidic.tools.finite_elements.comparison import FrameComparison
 
 DRAWS, STIFF = 8, 1.03
 RATIO = (0.87, 1.1)  # rms over the draws of difference over stated: .90 of displacement, .88 to 1.0 of strain

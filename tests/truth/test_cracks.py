@@ -30,8 +30,9 @@ from textures import Texture
 from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate, measure_sequence
 from rgbmidic.correlation import Deformed, Reference, TrackingState, fill, track
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.fields import crack_jump, stress_intensity
+from rgbmidic.fields import crack_jump
 from rgbmidic.settings import SolverSettings
+from rgbmidic.tools.finite_elements import stress_intensity
 from rgbmidic.weights import Statistics
 
 ERROR_NEAR = 0.019

@@ -18,8 +18,9 @@ from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
-from rgbmidic.results.result_in_units import ResultInUnits, placement_of
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import read_test
+from rgbmidic.tools.finite_elements import placement_of
 from rgbmidic.typing import FloatArray
 
 SHAPE, MIDDLE = (301, 301), 150.0
@@ -198,6 +199,7 @@ def test_with_a_camera_the_mesh_lies_on_its_plane(test_file: Path) -> None:
     path = test_file.with_name("by_camera.toml")
     path.write_text(test_file.read_text() + '[scale]\ncamera = "camera.json"\n')
     plan = Plan.from_settings(read_test(path))
-    assert plan.placement is not None
-    assert plan.placement.mm_per_pixel is None
+    assert plan.labels is not None
+    matrix = np.array(plan.labels.document["placement"]["matrix"])
+    assert matrix @ matrix.T == pytest.approx(np.eye(2)), "a rigid motion, for both have mm"
     assert plan.reference.mesh.nodes + plan.window.origin == pytest.approx(MESH.nodes, abs=1e-6)

@@ -7,8 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.extensions import LIGHT_WEIGHTS, MESH_SOURCES, PROBES, load_extension
+
 CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "results", "pipeline", "settings")
-TOOLS = {"typer", "rich", "bokeh", "matplotlib", *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view"))}
+TOOLS = {
+    *("typer", "rich", "bokeh", "matplotlib"),
+    *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view", "tools.finite_elements")),
+}
 SLOW = {"scipy.signal", "scipy.stats", "scipy.optimize", "numba", "llvmlite"}
 """Packages that would double the time until a command begins; a kernel imports numba with its first call."""
 LACKS = {
@@ -26,6 +34,16 @@ def test_no_part_imports_what_only_another_needs() -> None:
     code = "\n".join(["import sys", *steps])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert dict(zip(LACKS, done.stdout.split("\n"), strict=False)) == dict.fromkeys(LACKS, "")
+
+
+def test_what_a_tool_adds_is_found_and_what_is_missing_is_named() -> None:
+    assert callable(load_extension(LIGHT_WEIGHTS, "geometry", "weights.method"))
+    assert callable(load_extension(MESH_SOURCES, "finite_elements", "mesh.file").place)
+    assert callable(load_extension(PROBES, "tip", "probes.tips"))
+    with pytest.raises(
+        ConfigurationError, match=r'mesh.file needs the tool that adds "finite_elements"; there are none'
+    ):
+        load_extension({}, "finite_elements", "mesh.file")
 
 
 ROOT = Path(__file__).resolve().parents[2]

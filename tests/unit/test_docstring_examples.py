@@ -22,6 +22,7 @@ PACKAGES = [
             "pipeline",
             "report",
             "view",
+            "tools.finite_elements",
         )
     ),
 ]

@@ -14,7 +14,8 @@ from rgbmidic import correlation, frames, mesh, renamed, report, results, weight
 from rgbmidic import fields as rgbmidic_fields
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab import inspection
-from rgbmidic.results import comparison, simulation
+from rgbmidic.tools import finite_elements
+from rgbmidic.tools.finite_elements import comparison, simulation
 
 CLASSES = {
     "IlluminationImages": IlluminationImages,
@@ -24,6 +25,7 @@ CLASSES = {
     **vars(weights),
     **vars(mesh),
     **vars(inspection),
+    **vars(finite_elements),
     **vars(comparison),
     **vars(simulation),
     **vars(report),

@@ -34,7 +34,7 @@ from rgbmidic.lab.inspection.prediction import Prediction, predict, separate_wit
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame_quality import clipping, repetition, separation_doubts
-from rgbmidic.pipeline.plan import finite_elements_of, read_region
+from rgbmidic.pipeline.plan import place_mesh, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, ProgressCallback
 
@@ -97,7 +97,7 @@ def inspect_files(
         if roi is None and test.mesh.file is None:
             roi = read_region(test.region, shape)
         elif roi is None:
-            _, _, mesh, roi = finite_elements_of(test, shape)
+            mesh, roi, _ = place_mesh(test, shape)
             inspection_options["element_size"] = mesh.size
     inspection_options |= {key: value for key, value in options.items() if value is not None}
     try:

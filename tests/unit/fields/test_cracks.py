@@ -9,8 +9,9 @@ import pytest
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Nodal, NodalCovariance, Units, Williams, crack_jump, stress_intensity
-from rgbmidic.fields.crack_tip import williams_series
+from rgbmidic.fields import Nodal, NodalCovariance, Units, crack_jump
+from rgbmidic.tools.finite_elements import Williams, stress_intensity
+from rgbmidic.tools.finite_elements.crack_tip import williams_series
 
 SIZE = 14
 STD = 0.01

@@ -11,15 +11,16 @@ import pytest
 from nodal_tests import MESH, nodal_noise
 from results import make_result
 
-from rgbmidic import cli
+from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, cli, read_mesh
 from rgbmidic.command import execute
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
-from rgbmidic.results.comparison import Comparison, measured_mesh
-from rgbmidic.results.simulation import Levelling, Simulation, find_placement
+from rgbmidic.tools.finite_elements import measured_mesh
+from rgbmidic.tools.finite_elements.comparison import Comparison
+from rgbmidic.tools.finite_elements.comparison_page import scale_text
+from rgbmidic.tools.finite_elements.mesh_source import labels_of
+from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, find_placement
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
@@ -316,7 +317,7 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
 def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_another_order(tmp_path):
     mesh = finite_elements(name=str(tmp_path / "plate.vtu"))
     write_state(tmp_path / "plate.vtu", stretch(), mesh)
-    options = {"finite_elements": mesh, "placement": PLACEMENT, "references": [0]}
+    options = {"labels": labels_of(mesh, PLACEMENT), "references": [0]}
     result = measured(tmp_path / "r", np.stack([0 * stretch(), stretch()]), **options)
     order = np.random.default_rng(0).permutation(NODES)
     rows = [f"{mesh.node_numbers[i]},{stretch()[i, 0]},{stretch()[i, 1]}" for i in order]
@@ -373,7 +374,7 @@ def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path)
         element_numbers=mesh.element_numbers,
     )
     write_state(tmp_path / "plate.vtu", field[order], shuffled)
-    count, known = len(jump), {"finite_elements": mesh, "placement": PLACEMENT, "references": []}
+    count, known = len(jump), {"labels": labels_of(mesh, PLACEMENT), "references": []}
 
     def record(index: int) -> FrameRecord:
         u, v = PLACEMENT.vectors_to_px(mesh.points, field).T

@@ -17,7 +17,7 @@ import pytest
 
 from rgbmidic import FiniteElementMesh, read_mesh
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import mesh_file
+from rgbmidic.tools.finite_elements import mesh_file
 
 meshio = pytest.importorskip("meshio")
 

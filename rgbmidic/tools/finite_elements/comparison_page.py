@@ -16,9 +16,9 @@ from rgbmidic.errors import import_optional
 from rgbmidic.report import style
 from rgbmidic.report.figures import select_evenly
 from rgbmidic.report.page import render
-from rgbmidic.results.comparison import COMPARED_QUANTITIES, VARIANTS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, write_errors, write_table
 from rgbmidic.text import format_with_std
+from rgbmidic.tools.finite_elements.comparison import COMPARED_QUANTITIES, VARIANTS, Comparison, FrameComparison
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -303,6 +303,7 @@ def _page(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) 
     ]
     return render(
         "comparison.html",
+        Path(__file__).parent,
         comparison=comparison,
         frame_comparisons=frame_comparisons,
         simulation=Path(comparison.simulation.name).name,

@@ -26,13 +26,14 @@ import scipy.sparse as sp
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
-from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, rectification_of
-from rgbmidic.results.simulation import Levelling, Simulation, label_indices
 from rgbmidic.settings import ScaleSettings
+from rgbmidic.tools.finite_elements.placement import Placement
+from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, label_indices
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -187,7 +188,7 @@ class Comparison:
 
     Examples
     --------
-    >>> from rgbmidic.mesh import FiniteElementMesh
+    >>> from rgbmidic import FiniteElementMesh
     >>> mesh = FiniteElementMesh(
     ...     name="plate",
     ...     points=np.array([[0, 0], [10, 0], [10, 8], [0, 8]]),
@@ -466,27 +467,6 @@ class Comparison:
             degrees_of_freedom=freedom,
             probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
         )
-
-
-def measured_mesh(result: Result) -> FiniteElementMesh | None:
-    """Return the part of ``mesh.file`` that a result was measured on; None where it has none.
-
-    Examples
-    --------
-    >>> measured_mesh(Result.open("my_result")) is None  # its mesh is of no file
-    True
-    """
-    if result.node_number is None or result.element_number is None or result.node_mm is None:
-        return None
-    document = result.provenance["finite_elements"]
-    return FiniteElementMesh(
-        name=document["name"],
-        points=result.node_mm,
-        node_numbers=result.node_number,
-        elements=result.elements,
-        element_numbers=result.element_number,
-        numbering=document["numbering"],
-    )
 
 
 def _match_times(

@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import InputError, import_optional
-from rgbmidic.mesh.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, require_unique
-from rgbmidic.mesh.vtu import NUMBERS, entity_labels
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, require_unique
+from rgbmidic.tools.finite_elements.vtu import NUMBERS, entity_labels
 from rgbmidic.typing import IntArray
 
 logger = logging.getLogger(__name__)

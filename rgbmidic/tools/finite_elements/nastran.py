@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.mesh_file import CORNERS, MeshContent, parse_real, read_text
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MeshContent, parse_real, read_text
 
 _SHAPES = {
     **dict.fromkeys(("CTRIA3", "CTRIAR", "CTRIA6", "CPLSTN3", "CPLSTN6", "CPLSTS3", "CPLSTS6"), "triangle"),

@@ -13,7 +13,7 @@ direction of the crack, the shear modulus G and Kolosov's constant k::
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
 
@@ -483,6 +484,13 @@ class _Weighted:
         values = inverse @ (q.T @ self.data)
         chi_square = ((self.data - design @ values) ** 2).sum() / (len(self.data) - len(values))
         return values, inverse @ inverse.T, float(chi_square)
+
+
+def tip_probe(covariance: NodalCovariance, name: str, *place: float, settings: ProbeSettings, units: Units) -> CrackTip:
+    """Make the probe of one of the ``tips`` of ``[probes]``, which checks that the material is stated."""
+    keys = ("youngs_modulus", "poissons_ratio", "plane", "terms", "fit_tip")
+    williams: dict[str, Any] = {key: getattr(settings, key) for key in keys}
+    return CrackTip(covariance, name, *place, williams=Williams(units=units, **williams))
 
 
 def stress_intensity(

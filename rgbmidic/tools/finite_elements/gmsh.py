@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.mesh_file import MeshContent, limit_size
+from rgbmidic.tools.finite_elements.mesh_file import MeshContent, limit_size
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import pytest
 from rgbmidic import CameraCalibration, FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region
-from rgbmidic.mesh.placement import place_on_image
+from rgbmidic.tools.finite_elements.placement import place_on_image
 
 meshio = pytest.importorskip("meshio")
 

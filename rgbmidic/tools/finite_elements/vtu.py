@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size
 from rgbmidic.typing import AnyArray, IntArray
 
 NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")

@@ -24,11 +24,15 @@ from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.frames.names import NamedFiles
-from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
-from rgbmidic.results.result_in_units import placement_of, rectification_of
+from rgbmidic.results.result_in_units import rectification_of
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
+from rgbmidic.tools.finite_elements.files import read_mesh
+from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
+from rgbmidic.tools.finite_elements.mesh_source import placement_of
+from rgbmidic.tools.finite_elements.placement import Placement
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)

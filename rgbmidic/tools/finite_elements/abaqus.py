@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.mesh_file import CORNERS, MeshContent, parse_real, read_text
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MeshContent, parse_real, read_text
 
 logger = logging.getLogger(__name__)
 

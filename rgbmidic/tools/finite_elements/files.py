@@ -11,14 +11,15 @@ import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.mesh.abaqus import read_abaqus
-from rgbmidic.mesh.finite_elements import ROUNDING, FiniteElementMesh, cross
-from rgbmidic.mesh.gmsh import read_gmsh
-from rgbmidic.mesh.mesh_file import MeshContent
-from rgbmidic.mesh.meshio_formats import FORMATS, read_with_meshio
-from rgbmidic.mesh.nastran import read_nastran
-from rgbmidic.mesh.vtu import read_vtu
+from rgbmidic.mesh.triangles import cross
 from rgbmidic.settings import LENGTH_UNITS, require_regular_file
+from rgbmidic.tools.finite_elements.abaqus import read_abaqus
+from rgbmidic.tools.finite_elements.gmsh import read_gmsh
+from rgbmidic.tools.finite_elements.mesh import ROUNDING, FiniteElementMesh
+from rgbmidic.tools.finite_elements.mesh_file import MeshContent
+from rgbmidic.tools.finite_elements.meshio_formats import FORMATS, read_with_meshio
+from rgbmidic.tools.finite_elements.nastran import read_nastran
+from rgbmidic.tools.finite_elements.vtu import read_vtu
 from rgbmidic.typing import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)

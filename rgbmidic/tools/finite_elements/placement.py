@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,26 +17,13 @@ import numpy.typing as npt
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import FiniteElementMesh
-from rgbmidic.mesh.region import Region
-from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.source import Plane
 from rgbmidic.text import format_with_std
+from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
 from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
-
-
-class Plane(Protocol):
-    """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`."""
-
-    def to_mm(self, points: FloatArray) -> FloatArray:
-        """Return mm on the plane (N, 2) of points (N, 2) in px."""
-
-    def to_px(self, points: FloatArray) -> FloatArray:
-        """Return px of points (N, 2) in mm on the plane."""
-
-    def jacobian(self, points: FloatArray) -> FloatArray:
-        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mm axis, px axis]``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.mesh.triangles import cross, orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
@@ -150,19 +151,6 @@ class FiniteElementMesh:
         return None
 
 
-def orient_elements(
-    points: npt.ArrayLike, elements: npt.ArrayLike, name: str
-) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
-    """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
-    nodes = np.ascontiguousarray(as_numbers(points, f"{name} has finite nodes (N, 2)", (None, 2)))
-    corners = as_numbers(elements, f"{name} has elements (E, 3), indices of nodes", (None, 3), dtype=np.int32)
-    if not len(corners) or corners.min() < 0 or corners.max() >= len(nodes):
-        raise InputError(f"{name}: elements (E, 3) must be there and name existing nodes")
-    area = cross(nodes, corners)
-    corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
-    return nodes, corners, np.abs(area)
-
-
 def _depth(triangle: FloatArray, other_triangle: FloatArray) -> FloatArray:
     """Return the depth (n,) of `other_triangle` (n, 3, 2) within `triangle` from its nearest side.
 
@@ -173,9 +161,3 @@ def _depth(triangle: FloatArray, other_triangle: FloatArray) -> FloatArray:
     return np.asarray(
         np.einsum("nsk,nsck->nsc", inward, other_triangle[:, None] - triangle[:, :, None]).max(axis=2).min(axis=1)
     )
-
-
-def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
-    """Return twice the signed area (...) of triangles (..., 3)."""
-    first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

@@ -1,0 +1,40 @@
+"""What a TEST.toml may name and the core does not have: a tool adds it to one of these tables.
+
+`rgbmidic.tools.add_to_core` does so when `rgbmidic` is imported, by functions that import the tool: it is loaded by a
+test that needs it, however that is run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, TypeVar
+
+from rgbmidic.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from rgbmidic.fields import Probe
+    from rgbmidic.mesh import MeshSource
+    from rgbmidic.weights.light_weights import PrepareWeights
+
+T = TypeVar("T")
+
+LIGHT_WEIGHTS: dict[str, Callable[[], PrepareWeights]] = {}
+"""Methods of weighting by the name of ``weights.method``."""
+MESH_SOURCES: dict[str, Callable[[], MeshSource]] = {}
+"""Meshes of other origin, by the name under which a result keeps their document; ``mesh.file`` is "finite_elements"."""
+
+PROBES: dict[str, Callable[[], Callable[..., Probe]]] = {}
+"""Probes by their kind; called as those of `rgbmidic.fields` are, with the `settings` and `units` beside."""
+
+
+def load_extension(table: Mapping[str, Callable[[], T]], name: str, key: str) -> T:
+    """Return what a tool adds to one of the tables under a name, for what `key` of TEST.toml states.
+
+    Raises
+    ------
+    ConfigurationError
+        No tool adds it.
+    """
+    if name not in table:
+        raise ConfigurationError(f'{key} needs the tool that adds "{name}"; there are {", ".join(table) or "none"}')
+    return table[name]()

@@ -1,0 +1,39 @@
+"""Tools that stand on the public names of the core: each could be taken away."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rgbmidic import extensions
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rgbmidic.fields import Probe
+    from rgbmidic.mesh import MeshSource
+    from rgbmidic.weights.light_weights import PrepareWeights
+
+
+def add_to_core() -> None:
+    """Add to the core what a TEST.toml may name of a tool, which is imported when a test needs it."""
+    extensions.LIGHT_WEIGHTS["geometry"] = _geometry_weights
+    extensions.MESH_SOURCES["finite_elements"] = _finite_elements
+    extensions.PROBES["tip"] = _crack_tip
+
+
+def _geometry_weights() -> PrepareWeights:
+    from rgbmidic.scene.geometry_weights import GeometryWeights
+
+    return GeometryWeights.prepare
+
+
+def _finite_elements() -> MeshSource:
+    from rgbmidic.tools.finite_elements.mesh_source import MeshFile
+
+    return MeshFile()
+
+
+def _crack_tip() -> Callable[..., Probe]:
+    from rgbmidic.tools.finite_elements.crack_tip import tip_probe
+
+    return tip_probe
