@@ -6,15 +6,14 @@ import functools
 import inspect
 import math
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, cast, get_args, get_origin
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
-from rgbmidic.settings.conversion import convert_value, type_hints
+from rgbmidic.settings.conversion import convert_fields, convert_value, type_hints
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -55,11 +54,8 @@ def check_fields(instance: object, error: type[RgbmidicError] = InputError) -> N
     RgbmidicError
         A field is not of the type of its annotation.
     """
-    hints = type_hints(cast(Any, type(instance)))
-    for entry in fields(cast(Any, instance)):
-        value = getattr(instance, entry.name)
-        label = f"{entry.name} of {type(instance).__name__}"
-        object.__setattr__(instance, entry.name, _converted(value, hints[entry.name], label, error))
+    name = type(instance).__name__
+    convert_fields(instance, lambda entry, value, hint: _converted(value, hint, f"{entry.name} of {name}", error))
 
 
 def _converted(value: Any, hint: Any, label: str, error: type[RgbmidicError]) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rgbmidic._kernels.owned_pixels import LANES
 from rgbmidic._kernels.splines import PAD
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
@@ -24,8 +25,6 @@ BLOCK = 8
 """Side (px) of the blocks for each of which `warped_weights` knows whether all weights are 1: eight bytes, compared at
 once."""
 _NEVER = np.float32(1e9)
-_LANES = 8
-"""Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
 @helper(forceinline=True, fastmath=FAST)
@@ -133,7 +132,7 @@ def differences(
                 side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(remaining - 1))
                 n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
                 # whole vectors, of which the last one may be too long, where memory goes on so far
-                filled = (n + _LANES - 1) // _LANES * _LANES
+                filled = (n + LANES - 1) // LANES * LANES
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)

@@ -16,7 +16,7 @@ from rgbmidic._kernels.threads import FAST, compiled, helper
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
-_LANES = 8
+LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
@@ -108,7 +108,7 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
 def block_sums(start, stop, values, lines, run_offsets, side, out):
     """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
     out[:, start:stop] = 0
-    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
+    columns = np.zeros((len(values), out.shape[2] * side + LANES), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         _add(values, np.uint64(0), lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
@@ -117,7 +117,7 @@ def block_sums(start, stop, values, lines, run_offsets, side, out):
 def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets, side, out):
     """Sum fields (n, P) times one `weight` (P,) over blocks of `side` px: ``out`` (n, h, w)."""
     out[:, start:stop] = 0
-    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
+    columns = np.zeros((len(values), out.shape[2] * side + LANES), dtype=np.float32)
     products = np.empty((len(values), _largest(offsets)), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
@@ -152,7 +152,7 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
     ``out`` (k (k + 1), h, w) receives both sums, with the fields' `weights` (k, P), for each field with those up to it.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
     largest = _largest(offsets)
     field, root = np.empty((2, len(values), largest), dtype=np.float32)
     products = np.empty((len(out), largest), dtype=np.float32)
@@ -182,7 +182,7 @@ def score_sums(
     the `corrected` ones without the residual.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
     scores, states = np.empty((2, 6, _largest(offsets)), dtype=np.float32)
     inside, one = np.empty(_largest(offsets), dtype=np.float32), np.uint64(1)
     for e in range(run_offsets.size - 1):
@@ -262,7 +262,7 @@ def _add(fields, begin, lines, run_offsets, e, top, bottom, side, columns, out):
         low, high = min(low, column), max(high, column + number)
         at, to = np.uint64(slot) - begin, np.uint64(column)
         # whole vectors, of which the last one may be too long, where memory goes on so far
-        filled = (number + _LANES - 1) // _LANES * _LANES
+        filled = (number + LANES - 1) // LANES * LANES
         if np.int64(at) + filled > fields.shape[1]:
             filled = number
         for n in range(len(fields)):

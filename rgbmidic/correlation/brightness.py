@@ -166,13 +166,11 @@ class Brightness:
         return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), fit.side
 
 
-_ELEMENTS = 300
+ELEMENTS = 300
 """Elements from which a light's gain and offset are found: their medians are known to 7 % of the scatter (derived)."""
 
 
-def gain_and_offset(
-    moments: FloatArray, centres: FloatArray, constants: SolverConstants
-) -> tuple[FloatArray, FloatArray]:
+def gain_and_offset(moments: FloatArray, centres: FloatArray, min_correlation: float) -> tuple[FloatArray, FloatArray]:
     """Find the gain (k,) and the offset (k, 3) of each light, from elements that show the same texture in both states.
 
     The gain is the ratio of the standard deviations, which noise that is alike in both states changes little. It is NaN
@@ -185,17 +183,17 @@ def gain_and_offset(
         Sums of w, w f, w g, w f f, w f g, w g g over elements.
     centres : ndarray, shape (E, 2)
         Column and row of the elements.
-    constants
-        Of the solve.
+    min_correlation
+        Correlation coefficient of both states from which an element counts; -1: all with a texture do.
     """
     gains, offsets = np.full(len(moments), np.nan), np.zeros((len(moments), 3))
     for light, sums in enumerate(moments):
         (total, f, g, *_), (fg, ff, gg) = sums.T, centred_products(sums)
         total = np.maximum(total, 1e-30)
-        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(ff * gg))
+        is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(ff * gg))
         offsets[light, 0] = (g.sum() - f.sum()) / total.sum()
         if is_correlated.sum() > 0.1 * (ff > 0).sum():
-            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // _ELEMENTS]
+            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // ELEMENTS]
             gain = np.sqrt(gg[sample] / ff[sample])
             gains[light] = np.median(gain)
             offsets[light] = _offset_plane(centres[sample], (g[sample] - gain * f[sample]) / total[sample])

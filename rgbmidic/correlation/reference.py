@@ -63,6 +63,11 @@ class Deformed:
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     origin : tuple of int
         Column and row of the frame at which the images begin.
+
+    Examples
+    --------
+    >>> Deformed.prepare(np.ones((3, 40, 60), dtype=np.float32)).weights.shape
+    (3, 40, 60)
     """
 
     coefficients: FloatImage
@@ -190,6 +195,15 @@ class Reference:
         One of `PREFILTERS`.
     constants : SolverConstants
         Of the solve.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> reference.pixels.shape
+    (40, 60)
     """
 
     mesh: Tri3Mesh
@@ -288,7 +302,6 @@ class Reference:
         if brightness == "auto":
             sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
-        weighted *= level > DARK * level.max(axis=1, keepdims=True)
         inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
         for light, fit in enumerate(fits):
             for axis in light_gradient[:, light]:
@@ -335,7 +348,8 @@ class Reference:
         """
         gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
         if self.brightness != "none":
-            gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+            centres = self.mesh.centres - self.pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, self.constants.min_gain_correlation)
         has_gain = np.isfinite(gain)
         fits: list[GainFit | None] = [None] * len(weights)
         for light, fit in enumerate(self.gain_fits):

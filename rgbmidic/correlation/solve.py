@@ -199,6 +199,19 @@ def solve(
     ------
     InputError
         The two states have different numbers of images, or `initial` does not fit the mesh.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> deformed = Deformed.prepare(np.roll(speckle, 1, axis=2))
+    >>> solution = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), SolverSettings(), None)
+    >>> solution.displacement.mean(axis=0).round(2).tolist()
+    [1.0, 0.0]
     """
     if len(deformed.weights) != len(reference.images):
         raise InputError(

@@ -67,11 +67,19 @@ class Calibration:
     name
         Name in messages: the file name.
     unevenness
-        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.frame_check.unevenness`).
+        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.histogram.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; not changed by reading.
     extra
         Sections of the file that this class does not interpret, kept when the file is written again.
+
+    Examples
+    --------
+    >>> calibration = Calibration.read("calibration.json")
+    >>> calibration.crosstalk.lights, calibration.kind
+    (('red', 'green', 'blue'), 'bayer')
+    >>> calibration.crosstalk.matrix.shape
+    (3, 3)
     """
 
     crosstalk: Crosstalk | None = None
@@ -363,7 +371,7 @@ class TargetLights:
             if self.crop_origin is None and full_shape is not None and shape != full_shape:
                 raise CalibrationError(
                     f"{self.calibration.name} was made with frames of {_size(full_shape)} px, the photograph has "
-                    f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
+                    f"{_size(shape)} px: state `crop_origin`, where it begins in the calibrated frame"
                 )
             registration = self.calibration.cropped(self.crop_origin, shape).registration
         elif self.crop_origin is not None and registration is not None:

@@ -40,6 +40,14 @@ class PixelMap:
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     lines : ndarray, shape (R, 4), int32
         First slot, number of pixels, row and column in `bounds` of every run.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region, element_size=20), region)
+    >>> pixels.offsets[-1] == region.mask.sum()
+    np.True_
     """
 
     offsets: npt.NDArray[np.int64]

@@ -23,7 +23,8 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings

@@ -188,7 +188,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         if "finished" in self.provenance or self.table.damaged.any():
             raise ResultError(
                 f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-                "--resume` measures them again, --partial (partial=True) reads the rest"
+                "--resume` measures them again, `partial=True` reads the rest"
             )
         raise ResultError(
             f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
@@ -435,6 +435,12 @@ def finish_result(path: Path | str, warnings: Sequence[str] = ()) -> None:
     ------
     ResultError
         The folder is no result, a frame is missing or damaged, or it cannot be written.
+
+    Examples
+    --------
+    >>> finish_result("my_result")
+    >>> "finished" in Result.open("my_result").provenance
+    True
     """
     result = Result.open(path, partial=True, check=False)
     result.without_damaged()._check_complete()

@@ -54,6 +54,12 @@ class ScaleSettings(CheckedSettings):
         Frames per second, for files that do not state when their frames were taken.
     unit
         Unit of lengths: ``"mm"`` where the scale is known, or ``"px"`` of the image though it is.
+
+    Examples
+    --------
+    >>> scale = ScaleSettings(mm_per_pixel=0.05, frame_rate=100_000)
+    >>> scale.mm_per_pixel, scale.frame_rate
+    (0.05, 100000.0)
     """
 
     section = "scale"
@@ -119,6 +125,12 @@ class ProbeSettings(CheckedSettings):
         they are also subtracted from the displacements.
     names
         Pairs of a probe, kind and number, such as ``"gauge_1"``, and the name that it has in tables and curves.
+
+    Examples
+    --------
+    >>> probes = ProbeSettings(points=[[120, 80]], gauges=[[40, 80, 200, 80]])
+    >>> probes.gauges
+    ((40.0, 80.0, 200.0, 80.0),)
     """
 
     section = "probes"
@@ -159,7 +171,7 @@ class ProbeSettings(CheckedSettings):
         if self.tips and missing:
             yield (
                 'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
-                f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}'
+                f'"strain"); missing: {", ".join(missing)}'
             )
         if self.terms == 1:
             yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"
@@ -207,6 +219,12 @@ class ChannelSettings(CheckedSettings):
         Cross-section of the specimen in square mm, for a stress.
     force
         Name of the channel with the force; None: the only one whose name ends in N or kN.
+
+    Examples
+    --------
+    >>> channels = ChannelSettings(file="force.csv", trigger="trigger_V", area=40.0)
+    >>> channels.trigger, channels.offset
+    ('trigger_V', 0.0)
     """
 
     section = "channels"
@@ -252,6 +270,11 @@ class SetupSettings(CheckedSettings):
         Who tested.
     notes
         Anything else.
+
+    Examples
+    --------
+    >>> SetupSettings(lens="100 mm macro", aperture="f/8").aperture
+    'f/8'
     """
 
     section = "setup"
@@ -360,7 +383,7 @@ def section_types() -> dict[str, Any]:
 
 
 def read_test(path: Path | str) -> TestSettings:
-    r"""Read the settings of a test from a TOML file; paths in it are relative to it.
+    """Read the settings of a test from a TOML file; paths in it are relative to it.
 
     Parameters
     ----------
@@ -378,13 +401,9 @@ def read_test(path: Path | str) -> TestSettings:
 
     Examples
     --------
-    >>> from pathlib import Path
-    >>> from rgbmidic import read_test
-    >>> text = "[frames]\npath = 'frames/*.dng'\n[region]\nrectangle = [10, 10, 90, 70]\n[mesh]\nelement_size = 20\n"
-    >>> _ = Path("test.toml").write_text(text)
     >>> settings = read_test("test.toml")
-    >>> settings.mesh.element_size, settings.region.rectangle
-    (20.0, (10.0, 10.0, 90.0, 70.0))
+    >>> settings.frames.path, settings.calibration.file.name
+    (('frames/*.dng',), 'calibration.json')
     """
     path = Path(path)
     document = read_toml(path, "settings file")

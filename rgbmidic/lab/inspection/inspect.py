@@ -15,11 +15,12 @@ from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
-from rgbmidic.illumination.crosstalk import Crosstalk, align
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
-from rgbmidic.illumination.frame_check import Frame, check_state
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
+from rgbmidic.illumination.plane_samples import Frame
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
@@ -194,7 +195,7 @@ def inspect_frame(
     report(1, 3, "lights, and the errors of their separation")
     state, draw = separate_with_errors(linear, cropped_calibration, demosaic, noise)
     state = replace(state, registration=cropped_calibration.registration)
-    images = align(state)
+    images = state.on_first_light()
     report(2, 3, "uncertainty to expect")
     contrasts = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
     index = state.reflection_index()

@@ -73,10 +73,10 @@ def test_an_offset_is_a_plane_whatever_some_elements_show():
     g = 0.6 * f + plane[:, None]
     g[:15] += 50  # a reflection
     sums = np.stack([np.full(80, 200.0), f.sum(1), g.sum(1), (f * f).sum(1), (f * g).sum(1), (g * g).sum(1)], axis=1)
-    gain, offset = gain_and_offset(sums[None], centres, USUAL)
+    gain, offset = gain_and_offset(sums[None], centres, USUAL.min_gain_correlation)
     assert gain[0] == pytest.approx(0.6, rel=1e-6)
     np.testing.assert_allclose(offset[0, 0] + centres @ offset[0, 1:], plane, atol=0.8)
-    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL)
+    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL.min_gain_correlation)
     assert np.isnan(unlike[0][0])
     np.testing.assert_allclose(unlike[1], [[-f.mean(), 0.0, 0.0]])
 
