@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
+from weakref import ref
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @state_new_names
@@ -138,6 +140,31 @@ class Tri3Mesh:
     def centres(self) -> FloatArray:
         """Centre of each element, shape (E, 2), px."""
         return np.asarray(self.nodes[self.elements].mean(axis=1))
+
+    def derive(self, function: Callable[..., T], *arguments: Hashable) -> T:
+        """Return ``function(mesh, *arguments)``: what other modules derive from the mesh, kept as long as it lives.
+
+        The last eight results are kept: those over all elements, and those over the elements with data in a frame.
+
+        Parameters
+        ----------
+        function
+            Takes the mesh first.
+        *arguments
+            The others.
+
+        Returns
+        -------
+        object
+            What the function returns; not to be changed.
+        """
+        result: T = self._derived(function, *arguments)
+        return result
+
+    @cached_property
+    def _derived(self) -> Callable[..., Any]:
+        mesh = ref(self)  # no cycle: the results are freed with the mesh
+        return lru_cache(maxsize=8)(lambda function, *arguments: function(mesh(), *arguments))
 
     @cached_property
     def centre_tree(self) -> cKDTree:
