@@ -144,7 +144,7 @@ class Tri3Mesh:
     def derive(self, function: Callable[..., T], *arguments: Hashable) -> T:
         """Return ``function(mesh, *arguments)``: what other modules derive from the mesh, kept as long as it lives.
 
-        The last eight results are kept: those over all elements, and those over the elements with data in a frame.
+        The last twelve results are kept: of each function that over all elements, and over those with data in a frame.
 
         Parameters
         ----------
@@ -164,7 +164,7 @@ class Tri3Mesh:
     @cached_property
     def _derived(self) -> Callable[..., Any]:
         mesh = ref(self)  # no cycle: the results are freed with the mesh
-        return lru_cache(maxsize=8)(lambda function, *arguments: function(mesh(), *arguments))
+        return lru_cache(maxsize=12)(lambda function, *arguments: function(mesh(), *arguments))
 
     @cached_property
     def centre_tree(self) -> cKDTree:
