@@ -1,5 +1,5 @@
 """Nodemaps for CrackPy
-===================
+====================
 
 A result as CrackPy (Strohmann et al, DLR) reads it: a text file for each frame, from the CSV export.
 
