@@ -126,6 +126,13 @@ class SolverConstants:
         Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 noise-free coarse
         speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py). Half or
         twice of it changes displacements by .2 to .5 of their stated uncertainty, in a deep shadow by all of it.
+    max_smooth_fraction
+        Fraction of the squared residual in its means over blocks of that window, from which the light changes within
+        it: edges of shadows 1 to 15 px wide have .29 to .8, highlights that are added .25 to .5, vignetting of coarse
+        speckle .5 to .7, reflections on several lights .1 to .21, plain speckle .01 to .1 (measured).
+    gain_window_ratio
+        The window over the narrower one that follows such a light: plain speckle then errs by 3 % more, a shadow's edge
+        by half (benchmarks/grey_levels.py).
     min_gain_window
         ... and at least, px: one and a half blocks of its grid.
     min_block_side
@@ -211,6 +218,8 @@ class SolverConstants:
     min_gain_correlation: float = 0.3
     least_gain: float = 0.05
     gain_window_factor: float = 6.0
+    max_smooth_fraction: float = 0.25
+    gain_window_ratio: float = 3.0
     min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import (
     BLOCK,
@@ -17,7 +18,7 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import add_second_derivatives, correct_brightness, interpolate_nodal
+from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
@@ -39,6 +40,7 @@ from rgbmidic.correlation.images import (
     usable_reach,
 )
 from rgbmidic.correlation.texture import TextureGradient
+from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -81,20 +83,23 @@ class Deformed:
             self, "nonuniform_weight_blocks", np.stack([_count_nonuniform_blocks(weight) for weight in self.weights])
         )
 
-    def contains(self, points: FloatArray) -> BoolArray:
-        """Find the points that lie on pixels of the images.
+    def contains(self, points: FloatArray, std: FloatArray) -> BoolArray:
+        """Find the points that lie between pixels of the images, as far as their uncertainty says.
 
         Parameters
         ----------
         points : ndarray, shape (N, 2)
             x and y in px, counted from the first pixel.
+        std : ndarray, shape (N, 2)
+            Their standard uncertainty, px; NaN where not known. Four times of it may be noise, which 1 of 30,000 points
+            on the border exceeds.
 
         Returns
         -------
         ndarray, shape (N,), bool
         """
-        limits = np.array(self.weights.shape[:0:-1]) - 0.5
-        return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
+        margin, limits = 4 * np.nan_to_num(std), np.array(self.weights.shape[:0:-1]) - 1
+        return np.asarray(((points >= -margin) & (points <= limits + margin)).all(axis=1))
 
     def images_on_first_light(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
@@ -160,7 +165,7 @@ class Deformed:
 
 @state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
+class Reference(Derivable):
     """The reference state: its mesh and its images; everything a frame needs and no frame changes.
 
     Attributes
@@ -189,6 +194,8 @@ class Reference:
         Of each light's local gain with the `pixel_weights`; empty where the gain is one number.
     gradient : ndarray, shape (2, k, P), float32
         Gradient of the texture common to the lights, as each shows it, in local means per px; without what is a gain.
+    rim : ndarray, shape (P,), float32
+        1 at the pixels whose filtered grey level holds some of what lies beyond the region, else 0.
     texture : TextureGradient
         What it is computed from.
     prefilter : str
@@ -220,6 +227,7 @@ class Reference:
     brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
+    rim: FloatImage
     texture: TextureGradient
     prefilter: str
     registration: Registration | None = None
@@ -277,15 +285,16 @@ class Reference:
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
         state = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
-        inside = np.ones(region.mask.shape, dtype=np.float32)
+        inside, unmixed = np.ones(region.mask.shape, dtype=np.float32), usable_pixels(region.mask, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
-            inside *= usable_pixels(region.mask, prefilter)
+            inside *= unmixed
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             inside *= usable_pixels(~rasterise_lines(mesh.nodes[cracks], region.mask.shape), prefilter)
         mapped, assembly, material = aside(PixelMap.from_mesh, mesh, region), Assembly.from_mesh(mesh), material or mesh
         # what each frame needs of it, found while the pixels are
         _ = material.linear_fit_offset, material.colouring
         pixels, (prepared_images, usable) = mapped.result(), state.images_on_first_light(registration)
+        rim = pixels.gather(np.float32(1) - unmixed)
         usable = usable * inside
         if registration is None:
             values, weighted, light_gradient = (
@@ -326,13 +335,14 @@ class Reference:
             brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
+            rim=rim,
             texture=texture,
             prefilter=prefilter,
             registration=registration,
             constants=constants,
         )
 
-    def brightness_of(self, weights: FloatImage, moments: FloatArray) -> Brightness:
+    def brightness_of(self, weights: FloatImage, moments: FloatArray, is_changed: BoolArray) -> Brightness:
         """Estimate gain and offset of deformed images.
 
         Parameters
@@ -341,6 +351,8 @@ class Reference:
             Weights of the pixels that both states show.
         moments : ndarray, shape (k, E, 6)
             As of `Residual`.
+        is_changed : ndarray, shape (k,), bool
+            Lights whose weights are not the `pixel_weights`: where pixels are saturated, or off the frame.
 
         Returns
         -------
@@ -354,14 +366,15 @@ class Reference:
         fits: list[GainFit | None] = [None] * len(weights)
         for light, fit in enumerate(self.gain_fits):
             if has_gain[light]:
-                f, w = self.values[light], weights[light]
-                # other weights where pixels are saturated, or off the frame
-                same = np.array_equal(w, fit.weights)
-                fits[light] = fit if same else GainFit.over(f, w, self.pixels, fit.sigma)
+                fits[light] = fit
+                if is_changed[light]:
+                    fits[light] = GainFit.over(self.values[light], weights[light], self.pixels, fit.sigma)
         return Brightness(gain=np.where(has_gain, gain, 1.0), offset=offset, fits=tuple(fits))
 
-    def correct_brightness(self, brightness: Brightness, light: int, difference: FloatImage) -> None:
-        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
+    def brightness_fields(
+        self, brightness: Brightness, light: int, difference: FloatImage
+    ) -> tuple[AnyArray | int, ...]:
+        """Return what makes a light's residual ``(f - (g - b) / a) / level`` of its difference f - g, for kernels.
 
         Parameters
         ----------
@@ -370,12 +383,16 @@ class Reference:
         light
             Index of the light.
         difference : ndarray, shape (P,), float32
-            Of the grey levels; becomes the residual.
+            Of the grey levels.
+
+        Returns
+        -------
+        tuple
+            See `rgbmidic._kernels.owned_pixels.correct_brightness`.
         """
         _, _, *shape = self.pixels.bounds
-        scales, border = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
-        fields = self.values[light], self.inverse_level[light], scales, border, brightness.offset[light]
-        correct_brightness(self.pixels.lines, *fields, difference)
+        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
+        return self.values[light], self.inverse_level[light], *scales, brightness.offset[light]
 
     @property
     def gain_window(self) -> float | None:
@@ -422,6 +439,7 @@ class Reference:
         inverse = np.stack([xy**2 + yy**2, -(xx * xy + yx * yy), xx**2 + yx**2], axis=1)
         inverse /= np.maximum((xx * yy - xy * yx) ** 2, 1e-9)[:, None]
         stretch_change = np.clip(inverse - (1, 0, 1), -1, self.constants.max_stretch_change)
+        stretch_change[torn_elements(self.mesh, displacement, self.constants)] = 0  # that is no strain
         if np.sqrt((stretch_change**2).mean()) < self.constants.min_stretch_change:
             return self
         factors = filter_variance(self.prefilter) / 2 * (stretch_change * (1, 2, 1)).astype(np.float32)
@@ -431,6 +449,24 @@ class Reference:
         )
         fits = local_gain_fits(values, self.pixel_weights, self.pixels, self.gain_window)
         return replace(self, values=values, gain_fits=fits)
+
+    def with_gain_window(self, sigma: float) -> Reference:
+        """Return the reference with a gain that is smooth over a narrower window.
+
+        Parameters
+        ----------
+        sigma
+            Standard deviation of the window, px.
+
+        Returns
+        -------
+        Reference
+        """
+        fits, gradient = local_gain_fits(self.values, self.pixel_weights, self.pixels, sigma), self.gradient.copy()
+        for light, fit in enumerate(fits):
+            for axis in gradient[:, light]:
+                axis[:] = fit.remainder(axis / self.inverse_level[light], self.values[light])
+        return replace(self, gain_fits=fits, gradient=gradient * self.inverse_level)
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
@@ -545,6 +581,24 @@ class Reference:
         return out
 
 
+def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
+    """Find the elements (E,) whose nodes have gone with different bodies, as a displacement (N, 2) has it.
+
+    Their stretch C, the right Cauchy-Green tensor, differs from the median of the elements around.
+    """
+    deformation = np.eye(2) + mesh.element_gradient(displacement)
+    stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
+    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.max_relative_stretch)
+    if torn.any():
+        centre = mesh.centres
+        neighbours = cKDTree(centre).query(
+            centre[torn], k=[*range(1, min(constants.neighbour_count, len(centre)) + 1)]
+        )[1]
+        excess = stretch[torn] - np.median(stretch[neighbours], axis=1)
+        torn[torn] = np.linalg.norm(excess, axis=(1, 2)) > constants.max_relative_stretch
+    return torn
+
+
 def warp_arguments(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:
     """Runs of pixels, elements, shape functions and a motion (N, 2) of the nodes, for the kernels that follow it."""
     return pixels.runs, pixels.run_offsets, pixels.origin, mesh.elements, pixels.barycentric, motion
@@ -577,11 +631,12 @@ def _sample_registered_lights(
         np.empty((2, *leading_shape, inside.size), dtype=np.float32) for leading_shape in (values.shape[:1], ())
     )
     zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
+    is_changed = np.empty(len(mesh.elements), dtype=bool)
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         warp, spline = warp_arguments(mesh, pixels, motion), state.coefficients[light]
         differences(spline, zero, *warp, values[light])
         images = state.weights[light], state.nonuniform_weight_blocks[light], zero, values[light], inside
-        warped_weights(*images, *warp, weights[light], moments)
+        warped_weights(*images, *warp, weights[light], moments, is_changed)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
         sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient

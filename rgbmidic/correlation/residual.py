@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.owned_pixels import subtract_quadratic
-from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
+from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
+from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
@@ -78,14 +78,18 @@ class Residual:
         values = reference.values
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
+        is_changed = np.empty(moments.shape[:2], dtype=bool)
         for light, displacement in enumerate(displacements):
             warp = reference.warp(deformed, light, displacement)
             differences(deformed.coefficients[light], values[light], *warp, difference[light])
             images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
-            warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
-        brightness = reference.brightness_of(weights, moments)
+            states = *images, reference.pixel_weights[light]
+            warped_weights(*states, *warp, weights[light], moments[light], is_changed[light])
+        brightness = reference.brightness_of(weights, moments, np.asarray(is_changed.any(axis=1)))
         for light, light_difference in enumerate(difference):
-            reference.correct_brightness(brightness, light, light_difference)
+            fields = reference.brightness_fields(brightness, light, light_difference)
+            pixels = reference.pixels
+            correct_brightness(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, light_difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -114,6 +118,37 @@ class Residual:
         out = np.empty((len(weights), len(pixels.origin), 3))
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
+
+    def with_values(self, values: FloatImage) -> Residual:
+        """Return it for other grey levels (k, P) of the reference, with the brightness as it is.
+
+        Parameters
+        ----------
+        values : ndarray, shape (k, P), float32
+            Such as those of a reference before `Reference.filtered_as`.
+
+        Returns
+        -------
+        Residual
+        """
+        if values is self.reference.values:
+            return self
+        difference = values - self.reference.values
+        difference *= self.reference.inverse_level
+        difference += self.difference
+        return replace(self, difference=difference)
+
+    @property
+    def smooth_fraction(self) -> float:
+        """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
+        pixels, window = self.reference.pixels, self.reference.gain_window
+        if window is None:
+            return 0.0
+        smooth, side = 0.0, block_side(window)
+        for residual, weight in zip(self.difference, self.weights, strict=True):
+            sums, total = pixels.weighted_block_sums(residual, weight, side, with_weight=True)
+            smooth += float((sums**2 / np.maximum(total, 1e-30)).sum())
+        return smooth / max(float(self.squares(self.weights)[..., 0].sum()), 1e-300)
 
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
@@ -147,6 +182,8 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+    rim_differs
+        The rim of the region shows another body somewhere, which has drawn the residual's displacement.
 
     Examples
     --------
@@ -156,6 +193,7 @@ class Precision:
 
     factor: FloatImage
     loss_curvature: FloatImage
+    rim_differs: bool = False
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.

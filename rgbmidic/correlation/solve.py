@@ -96,8 +96,10 @@ def next_weighting(
 ) -> Weighting:
     """Find residual, matching and precision anew at the displacement found by pass `number`."""
     residual, method = compare(problem, estimate), problem.method
+    # the residual that the pass has minimised: by other grey levels the displacement is not yet the best
+    minimised = residual.with_values(last.residual.reference.values)
     # without the precision of the lights, which the first pass has not, an element half on another body may match
-    precision = last.precision if number or method is None else method.precision(residual)
+    precision = last.precision if number or method is None else method.precision(minimised)
     matched = matching_elements(residual, estimate.displacement, precision)
     if not matched.all() or estimate.longest > problem.constants.first_pass_tolerance:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
@@ -110,7 +112,7 @@ def next_weighting(
         return weighting
     return replace(
         weighting,
-        precision=precision if number == 0 or method is None else method.precision(residual),
+        precision=precision if number == 0 or method is None else method.precision(minimised),
         weighting_displacement=estimate.displacement,
     )
 
@@ -137,11 +139,13 @@ def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, e
 
     Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
     pass in which they do the residual is still that of a wrong match. It is learnt once more where the nodes have moved
-    since.
+    since, and twice where another body at the region's rim has drawn the edge.
     """
     if (matched & ~last.matched).any():
         return number + 1
     constants = last.residual.reference.constants
+    if last.precision is not None and last.precision.rim_differs:
+        return max(last.reweight_until, constants.max_reactivation_passes)
     motion = np.hypot(*(estimate.displacement - last.weighting_displacement).T)[equations.textured]
     has_moved = (
         number == 1 < len(last.residual.weights)
@@ -252,15 +256,13 @@ def _passes(
         equations = _equations(problem, weighting, estimate)
         pass_tolerance = max(tolerance, problem.constants.first_pass_tolerance) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
+        reference = problem.reference
+        if number == 0:
+            problem = replace(problem, reference=reference.filtered_as(estimate.displacement))
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            reference = with_consistent_gradient(weighting.residual, weighting.weights()).filtered_as(
-                estimate.displacement
-            )
-            if reference is not problem.reference:
-                same, problem = reference.values is problem.reference.values, replace(problem, reference=reference)
-                residual = replace(weighting.residual, reference=reference) if same else compare(problem, estimate)
-                weighting, equations = replace(weighting, residual=residual), None
+            problem, weighting = _adapt_reference(problem, weighting, estimate)
+            equations = equations if problem.reference is reference else None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
@@ -273,6 +275,22 @@ def _passes(
             estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, estimate))
     return problem, estimate, equations, weighting
+
+
+def _adapt_reference(problem: Problem, weighting: Weighting, estimate: Estimate) -> tuple[Problem, Weighting]:
+    """Adapt the reference's gradients, and the window of the gain, to what the first pass shows."""
+    constants, residual = problem.constants, weighting.residual
+    adapted = with_consistent_gradient(residual, weighting.weights())
+    if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
+        problem = replace(problem, reference=adapted)
+        return problem, replace(weighting, residual=replace(residual, reference=adapted))
+    assert adapted.gain_window is not None  # without one nothing is smooth
+    narrow = adapted.with_gain_window(adapted.gain_window / constants.gain_window_ratio)
+    problem = replace(problem, reference=narrow)
+    residual, precision = compare(problem, estimate), weighting.precision
+    if problem.method is not None:
+        precision = problem.method.precision(residual)
+    return problem, replace(weighting, residual=residual, precision=precision)
 
 
 @stage("search")
@@ -349,7 +367,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
-    inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
+    positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
+    inside = problem.deformed.contains(positions, std[:, :2])
     node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any() and np.isnan(std[equations.textured]).all():

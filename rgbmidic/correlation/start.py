@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.nodes import correlation_around, torn_elements
-from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.nodes import correlation_around
+from rgbmidic.correlation.reference import Deformed, Reference, torn_elements
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, interpolate_motion
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
 from rgbmidic.correlation.solve import solve

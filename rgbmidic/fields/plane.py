@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
@@ -392,6 +393,7 @@ class CameraCalibration(Plane):
             return False
 
     @classmethod
+    @checked
     def read(cls, path: Path | str) -> Self:
         """Read the file that ``rgbmidic-calibrate camera`` wrote.
 

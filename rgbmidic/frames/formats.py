@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, NoReturn, TypedDict, Unpack
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.bitmaps import BmpFile, PgmFile
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
@@ -233,6 +234,7 @@ class FrameMetadata(TypedDict, total=False):
     dtype: Literal["uint8", "uint16", ">u2"] | None
 
 
+@checked
 def read_frame(path: Path | str, **metadata: Unpack[FrameMetadata]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 

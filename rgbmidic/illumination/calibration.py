@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
-from rgbmidic.arguments import check_fields
+from rgbmidic.arguments import check_fields, checked
 from rgbmidic.disk import write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
@@ -179,6 +179,7 @@ class Calibration:
         )
 
     @classmethod
+    @checked
     def read(cls, path: Path | str) -> Calibration:
         """Read a calibration file.
 
@@ -204,6 +205,7 @@ class Calibration:
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
+    @checked
     def from_document(cls, document: dict[str, Any], name: str = "the calibration") -> Calibration:
         """Return the calibration of a JSON document.
 

@@ -425,7 +425,9 @@ def without_dark_pixels(images: IlluminationImages, weights: FloatImage) -> Floa
     """
     threshold, out = DARK * images.full_scale, weights
     for light, image in enumerate(images.values):
-        reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(image, None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+        if not np.isfinite(reduced).all():
+            reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
         if reduced.min() <= threshold:  # else no mean over a wider window is
             is_dark = ~(local_mean(image, _DARK_WINDOW) > threshold)
             out = weights.copy() if out is weights else out

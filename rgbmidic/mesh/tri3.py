@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any, TypeVar
-from weakref import ref
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +17,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
+from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import orient_elements
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
@@ -26,12 +26,11 @@ from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
-T = TypeVar("T")
 
 
 @state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tri3Mesh:
+class Tri3Mesh(Derivable):
     """Triangles on the reference image. Its arrays are not writable, because derived quantities are cached.
 
     Attributes
@@ -140,31 +139,6 @@ class Tri3Mesh:
     def centres(self) -> FloatArray:
         """Centre of each element, shape (E, 2), px."""
         return np.asarray(self.nodes[self.elements].mean(axis=1))
-
-    def derive(self, function: Callable[..., T], *arguments: Hashable) -> T:
-        """Return ``function(mesh, *arguments)``: what other modules derive from the mesh, kept as long as it lives.
-
-        The last twelve results are kept: of each function that over all elements, and over those with data in a frame.
-
-        Parameters
-        ----------
-        function
-            Takes the mesh first.
-        *arguments
-            The others.
-
-        Returns
-        -------
-        object
-            What the function returns; not to be changed.
-        """
-        result: T = self._derived(function, *arguments)
-        return result
-
-    @cached_property
-    def _derived(self) -> Callable[..., Any]:
-        mesh = ref(self)  # no cycle: the results are freed with the mesh
-        return lru_cache(maxsize=12)(lambda function, *arguments: function(mesh(), *arguments))
 
     @cached_property
     def centre_tree(self) -> cKDTree:

@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
@@ -168,6 +169,7 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
     write_table(file, columns, zip(*(values.tolist() for values in columns.values()), strict=True))
 
 
+@checked
 def read_histories(
     result: Result,
     probes: ProbeSettings,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import read_arrays, read_json, write_json
@@ -114,6 +115,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
     node_mm: FloatArray | None = None
 
     @classmethod
+    @checked
     def open(cls, path: Path | str, *, partial: bool = False, check: bool = True) -> Self:
         """Open a result folder.
 
@@ -287,6 +289,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         values = next(self.table.iterate(None, [int(index) % len(self)]))
         return FrameRecord(values=values, sizes=self.table.sizes)
 
+    @checked
     def iterate(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
 
@@ -304,6 +307,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         indices = range(len(self)) if frames is None else frames
         return (values[name] for values in self.table.iterate([name], indices))
 
+    @checked
     def stack(self, name: str) -> AnyArray:
         """Read one quantity of all frames into one array, the frames as first axis.
 

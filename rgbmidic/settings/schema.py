@@ -19,6 +19,7 @@ from rgbmidic.settings.conversion import (
     CheckedSettings,
     bounded,
     check_names,
+    convert_value,
     read_section,
     read_table,
     read_toml,
@@ -354,13 +355,16 @@ class TestSettings(CheckedSettings):
         ConfigurationError
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
-        base, kinds = Path(base).resolve(), section_types()
+        if not isinstance(document, Mapping):
+            raise ConfigurationError(f"the document of a test maps sections to their keys; given is {document!r:.80}")
+        folder: Path = convert_value(base, Path, "base").resolve()
+        kinds = section_types()
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
         document = without_former_keys(document)
-        sections = {name: read_section(kinds[name], name, read_table(document, name), base) for name in document}
-        return cls(base=base, **sections)
+        sections = {name: read_section(kinds[name], name, read_table(document, name), folder) for name in document}
+        return cls(base=folder, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
         """Return the settings as sections of plain values, defaults included, without `base` and what is not known.
@@ -405,12 +409,12 @@ def read_test(path: Path | str) -> TestSettings:
     >>> settings.frames.path, settings.calibration.file.name
     (('frames/*.dng',), 'calibration.json')
     """
-    path = Path(path)
-    document = read_toml(path, "settings file")
+    file: Path = convert_value(path, Path, "read_test: path")
+    document = read_toml(file, "settings file")
     try:
-        return TestSettings.from_mapping(document, path.parent)
+        return TestSettings.from_mapping(document, file.parent)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{path}: {error}") from None
+        raise ConfigurationError(f"{file}: {error}") from None
 
 
 _FORMER_BRIGHTNESS = {"global": "constant", "local": "auto", "mean": "auto"}

@@ -175,7 +175,7 @@ def inspect_frame(
     >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
     ('monochrome', True, 0.0)
     """
-    frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
+    frames = tuple(frame) if isinstance(frame, Sequence) else (frame,)
     shape = _require_shape(frames)
     cropped_calibration = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
@@ -303,6 +303,8 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
 
 def _require_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     """Return the rows and columns of frames that can be inspected."""
+    if not (frames and all(isinstance(frame, Mosaic | ChannelFrame) for frame in frames)):
+        raise InputError(f"an inspection needs a frame, or one of each light in succession, not {frames!r:.80}")
     first, shapes = frames[0], {frame.values.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
