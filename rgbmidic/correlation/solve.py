@@ -357,8 +357,9 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     table = BlockTable.of_all(residual, equations.weights)
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
-        step = recovery.field(*gradient_step(weighting.residual, equations).T)
-        std = np.hypot(std, excess_over_chance(step, std, residual, table, equations.weights))
+        step = recovery.value @ gradient_step(weighting.residual, equations)
+        excess = excess_over_chance(step, std[:, :2], residual, table, equations.weights)
+        std = std * np.hypot(1, excess)[:, None]
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         lights = BlockTable.of_lights(residual, equations.weights, problem.constants.min_block_side)
