@@ -15,11 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from measures import area_stds
 from rgbmidic import Status, correlate, measure_sequence
 from rgbmidic.correlation import Solution
 from rgbmidic.fields import at_nodes, at_pixels, field_rms, high_pass
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.measures import area_stds
 from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray

@@ -88,28 +88,6 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 
 @app.command()
-def sample(
-    name: Annotated[str, Argument(metavar="NAME", help="Name of a sample; without it, all are listed.")] = "",
-    folder: Annotated[Path | None, Argument(metavar="FOLDER", help="New or empty folder; else NAME.")] = None,
-) -> None:
-    """Download published real files with a TEST.toml for them, or list the available samples."""
-    from rgbmidic.lab.samples import SAMPLES, write_sample
-
-    if not name:
-        columns = ["sample", "MB", "licence", "source", "shows"]
-        rows = [
-            [entry.name, f"{entry.bytes / 1e6:.1f}", entry.licence, entry.source, entry.shows]
-            for entry in SAMPLES.values()
-        ]
-        print_table("real files of others, fetched from their sources and checked by SHA-256", columns, rows)
-        return
-    out = folder or Path(name)
-    dataset = write_sample(name, out, note)
-    print(f"{dataset.shows}\nlicence: {dataset.licence}   source: {dataset.source}")
-    print(f"try: cd {out} && {dataset.command}")
-
-
-@app.command()
 def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")], out: Out) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset

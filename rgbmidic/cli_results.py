@@ -52,11 +52,11 @@ def figures(
 @result_options
 def export(
     source: ResultSource,
-    out: Annotated[Path, Option(help="File to write; for crackpy a folder.")],
-    to: Annotated[str, Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
+    out: Annotated[Path, Option(help="File to write.")],
+    to: Annotated[str, Option(help="Format: npz, csv or hdf5.")] = "npz",
     overwrite: command.Overwrite = False,
 ) -> None:
-    """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
+    """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet."""
     from rgbmidic.results import export_result
 
     export_result(source.result, to, out, scale=source.scale(), overwrite=overwrite)

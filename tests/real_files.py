@@ -13,52 +13,24 @@ RealData = Callable[..., Path]
 """Type of the fixture `real_data`: from the name of a folder, and of a file it must hold, to the folder."""
 
 CROPS = Path(__file__).parent / "data"
-SAMPLES = {
-    "dic_rigid_shift": "shift",
-    "dic_challenge_sample12": "open-hole",
-    "dic_challenge_sample14": "sinusoid",
-    "dic_challenge2_wave": "wave",
-    "dic_real_tension_mudic": "tension",
-    "mraw_8bit_cih": "beam",
-    "cine_color_packed10": "colour-cine",
-    "raw_colorchart_dng": "colour-dng",
-    "multilight_raw_coin_italy": "coin",
-}
-"""Names in `rgbmidic sample` of the folders whose full files it fetches into its cache."""
 
 
 def real_folder(name: str, file: str = "") -> Path:
-    """The folder `name` of RGBMIDIC_SHARED_DATA (else ../shared/data), of the cache of samples, or of tests/data.
+    """The folder `name` of RGBMIDIC_SHARED_DATA (else ../shared/data), or of tests/data.
 
-    A test is skipped whose folder, or `file` of it, is in none of them.
+    A test is skipped whose folder, or `file` of it, is in neither.
     """
     full = full_folder(name)
-    for folder in (full, *_cached(name), CROPS / name):
+    for folder in (full, CROPS / name):
         if folder.is_dir() and (folder / file).exists():
             return folder
-    sample = f", nor in the cache (`rgbmidic sample {SAMPLES[name]}`, with a network)" if name in SAMPLES else ""
-    pytest.skip(f"no shared data at {full / file}{sample}; its licence or size keeps it out of tests/data")
+    pytest.skip(f"no shared data at {full / file}; its licence or size keeps it out of tests/data")
 
 
 def full_folder(name: str) -> Path:
     """Where the full files of a folder lie, if they are on this machine."""
     stated = os.environ.get("RGBMIDIC_SHARED_DATA")
     return (Path(stated) if stated else Path(__file__).resolve().parents[2] / "shared" / "data") / name
-
-
-def _cached(name: str) -> list[Path]:
-    """The folder of a sample that is whole in the cache."""
-    from rgbmidic.errors import InputError
-    from rgbmidic.lab import samples
-
-    if name not in SAMPLES:
-        return []
-    sample = samples.SAMPLES[SAMPLES[name]]
-    try:
-        folder = samples.cache_folder() / sample.name
-    except InputError:  # without pooch
-        return []
-    return [folder] if all((folder / file.name).is_file() for file in sample.files) else []
 
 
 def corner(folder: Path) -> tuple[int, int]:

@@ -53,7 +53,6 @@ MODULES = [
     "rgbmidic.lab.demo",
     "rgbmidic.lab.inspection",
     "rgbmidic.lab.planning",
-    "rgbmidic.lab.measures",
     "rgbmidic.lab.virtual",
     "rgbmidic.errors",
     "rgbmidic.typing",

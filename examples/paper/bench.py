@@ -13,10 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rgbmidic import Calibration, Region
-from rgbmidic.errors import InputError
-from rgbmidic.illumination import IlluminationImages, separate
-from rgbmidic.lab.measures import (
+from measures import (
     Goniometry,
     MeasureArea,
     areas_along_x,
@@ -29,6 +26,9 @@ from rgbmidic.lab.measures import (
     slope_uncertainty,
     wrinkle_spacing,
 )
+from rgbmidic import Calibration, Region
+from rgbmidic.errors import InputError
+from rgbmidic.illumination import IlluminationImages, separate
 from rgbmidic.lab.virtual import (
     Camera,
     Light,

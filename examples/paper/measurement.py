@@ -18,12 +18,12 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from bench import Bench, Topography
+from measures import Goniometry, area_means, area_stds, residual_percent
 from rgbmidic import Region, Solution, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference, Residual, find_initial_guess, solve
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.lab.measures import Goniometry, area_means, area_stds, residual_percent
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.weights import SetUpThreshold, Statistics, threshold_weights
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -134,7 +133,7 @@ def discretisation_error(
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
         return with_one_sided_error(mesh, solution)
-    refined, noise_statistics = _refined_mesh(reference)
+    refined, noise_statistics = reference.derive(_refined_mesh)
     with one_blas_thread():
         values, variance, deformation = _finer_field(refined, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
@@ -347,9 +346,8 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """Corners of the four parts of an element, 3 to 5 being the middles of its edges 01, 12 and 20."""
 
 
-@lru_cache(maxsize=1)
 def _refined_mesh(reference: Reference) -> tuple[_RefinedMesh, _NoiseStatistics]:
-    """Halve the elements of a reference, and find what noise does; the last result is kept."""
+    """Halve the elements of a reference, and find what noise does."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
     edge_index = np.unique(edge_keys(mesh.elements[:, EDGES].reshape(-1, 2), count), return_inverse=True)[1]
     six = np.concatenate([mesh.elements, count + edge_index.reshape(-1, 3)], axis=1)

@@ -10,7 +10,6 @@ operators that it judges, its result has a fifth of the noise of the displacemen
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +75,6 @@ class OneSidedConstants:
 _CONSTANTS = OneSidedConstants()
 
 
-@lru_cache(maxsize=2)
 def cubic_fit_offset(mesh: Tri3Mesh) -> FloatArray:
     """Evaluate at each node n the best linear fit of x^3, x^2 y, x y^2, y^3 about n, (N, 4) in cubic px."""
     point, weight = (values / 2 for values in np.polynomial.legendre.leggauss(3))
@@ -110,7 +108,7 @@ def _recovered_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix, nodes: BoolArray)
     selected = nodes[row]
     row, column = row[selected], operator.indices[selected]
     x, y = (mesh.nodes[column] - mesh.nodes[row]).T
-    fitted = _fitted_cubics(x, y, mesh.linear_fit_offset[column], cubic_fit_offset(mesh)[column])
+    fitted = _fitted_cubics(x, y, mesh.linear_fit_offset[column], mesh.derive(cubic_fit_offset)[column])
     products = (operator.data[selected, None] * fitted).T
     return np.stack([np.bincount(row, values, len(nodes)) for values in products], axis=1)
 
@@ -143,7 +141,6 @@ class _BoundaryFits:
     factors: FloatArray
 
 
-@lru_cache(maxsize=2)  # of a mesh with data everywhere, and of the last frame
 def _boundary_fits(mesh: Tri3Mesh, active: bytes) -> _BoundaryFits:
     """Fit cubics to the nodes up to three edges of `active` elements away."""
     elements, count = np.frombuffer(active, dtype=bool), len(mesh.nodes)
@@ -227,7 +224,7 @@ def one_sided_error(mesh: Tri3Mesh, active: BoolArray, displacement: FloatArray,
         Error of u, v, exx, eyy, exy as a standard deviation: the root of a mean square over some elements
         along the boundary, beyond noise. 0 at other nodes.
     """
-    fits = _boundary_fits(mesh, active.tobytes())
+    fits = mesh.derive(_boundary_fits, active.tobytes())
     u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
     half_x, half_y = (with_data(slope, slope.data / 2) for slope in (fits.slope_x, fits.slope_y))
     single_terms = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))

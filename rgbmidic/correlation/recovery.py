@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -162,8 +161,8 @@ def quadratic_fit(
     tuple of csr_matrix, shape (N, N) or (`first`, N)
         In the order of `TERMS`, per px and square px.
     """
-    neighbours, entries, weight, structure = _window(mesh, active.tobytes())
-    basis = _basis(mesh, active.tobytes(), None if offset is None else offset.tobytes())
+    neighbours, entries, weight, structure = mesh.derive(_window, active.tobytes())
+    basis = mesh.derive(_basis, active.tobytes(), None if offset is None else offset.tobytes())
     if first is not None:
         neighbours, weight, basis, structure = neighbours[:first], weight[:first], basis[:first], structure[:first]
         entries = entries[: structure.nnz]
@@ -224,11 +223,8 @@ def slope_operators(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, s
     return along_x, along_y
 
 
-@lru_cache(maxsize=2)  # of a mesh and of its halves
 def _window(mesh: Tri3Mesh, active: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
     """Return the nodes that the polynomial of each node is fitted to.
-
-    The last result is kept, for most frames use all elements.
 
     Returns
     -------
@@ -281,10 +277,9 @@ def at_free_boundary(mesh: Tri3Mesh, active: BoolArray | None = None) -> BoolArr
     return at_boundary
 
 
-@lru_cache(maxsize=4)  # with and without the offset
 def _basis(mesh: Tri3Mesh, active: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
-    neighbours = _window(mesh, active)[0]
+    neighbours = mesh.derive(_window, active)[0]
     sizes = mesh.sizes[:, None]
     x, y = ((axis[neighbours] - axis[:, None]) / sizes for axis in mesh.nodes.T)
     basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)

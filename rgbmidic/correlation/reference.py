@@ -40,6 +40,7 @@ from rgbmidic.correlation.images import (
     usable_reach,
 )
 from rgbmidic.correlation.texture import TextureGradient
+from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -164,7 +165,7 @@ class Deformed:
 
 @state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
+class Reference(Derivable):
     """The reference state: its mesh and its images; everything a frame needs and no frame changes.
 
     Attributes

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -207,7 +206,7 @@ class MeshPoints:
         -------
         csr_matrix, shape (P, N)
         """
-        fits = _fits(self.mesh, has_data.tobytes())
+        fits = self.mesh.derive(_fits, has_data.tobytes())
         return sp.csr_matrix(sum(matrix @ fit for matrix, fit in zip(self._matrices(), fits, strict=True)))
 
     def read(self, values: FloatArray) -> FloatArray:
@@ -225,7 +224,7 @@ class MeshPoints:
         """
         valid = np.isfinite(values)
         has_data = np.asarray(valid.reshape(len(values), -1).all(axis=1))
-        terms = (fit @ np.where(valid, values, 0) for fit in _fits(self.mesh, has_data.tobytes()))
+        terms = (fit @ np.where(valid, values, 0) for fit in self.mesh.derive(_fits, has_data.tobytes()))
         field = np.asarray(sum(matrix @ term for matrix, term in zip(self._matrices(), terms, strict=True)))
         field[~self.measured(has_data)] = np.nan
         return field
@@ -351,14 +350,13 @@ class PointSum:
         """
         measured = (has_data[self.corners] | ~self.needed).all(axis=1)
         node, weights = self.corners[measured].ravel(), np.zeros((len(self.moments), len(has_data)))
-        fits = _fits(self.submesh, has_data.tobytes())[: 1 if linear else None]
+        fits = self.submesh.derive(_fits, has_data.tobytes())[: 1 if linear else None]
         for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=False):
             nodal_weights = [np.bincount(node, weights=moment.ravel(), minlength=len(has_data)) for moment in sums]
             weights += np.asarray(nodal_weights) @ fit
         return weights, float(self.count[measured].sum())
 
 
-@lru_cache(maxsize=4)  # a few meshes, as a rule with data at all nodes: 8 MB each for 8,000 of them
 def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     """Matrices (N, N) from nodal values to the value at each node and to its slopes along x and y."""
     is_complete = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))

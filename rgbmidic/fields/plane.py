@@ -24,7 +24,7 @@ from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.illumination.images import Registration
-from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh import Plane, Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import format_with_std
@@ -78,8 +78,19 @@ def undistorted(lens: FloatArray, points: FloatArray) -> FloatArray:
         return np.asarray(np.where(np.abs(distorted(lens, straight) - points) < 1e-6, straight, np.nan))
 
 
+def _homography(values: FloatArray) -> FloatArray:
+    """Return the homography (3, 3) of parameters (16,)."""
+    return np.asarray(np.r_[values[8:], 1.0].reshape(3, 3))
+
+
+def _projected(homography: FloatArray, points: FloatArray) -> FloatArray:
+    """Map points (N, 2) by a homography (3, 3)."""
+    homogeneous = np.c_[points, np.ones(len(points))] @ homography.T
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CameraCalibration:
+class CameraCalibration(Plane):
     """Lens and plane of a camera, as ``rgbmidic-calibrate camera`` writes them; either may be unknown.
 
     Attributes
@@ -142,65 +153,23 @@ class CameraCalibration:
             raise InputError(f"{self.name} holds no plane: photograph the target on it (`rgbmidic-calibrate camera`)")
         return np.asarray(np.r_[lens, self.homography.ravel()[:8]])
 
-    def to_mm(self, points: FloatArray, parameters: FloatArray | None = None) -> FloatArray:
-        """Return where points of the image lie on the plane.
+    def to_mm(self, points: FloatArray) -> FloatArray:  # noqa: D102
+        return self._to_mm(points, self.parameters)
 
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            (x, y) in px of the frame; NaN stays NaN.
-        parameters : ndarray, shape (16,), optional
-            In place of the calibrated ones.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            (x, y) in mm.
-
-        Raises
-        ------
-        InputError
-            The calibration holds no plane.
-        """
-        values = self.parameters if parameters is None else parameters
+    def _to_mm(self, points: FloatArray, values: FloatArray) -> FloatArray:
+        """Return `to_mm` with `values` (16,) as parameters."""
         straight = points if self.lens is None else undistorted(values[:8], points)
-        homogeneous = np.c_[straight - self.centre, np.ones(len(points))] @ np.r_[values[8:], 1.0].reshape(3, 3).T
-        return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
+        return _projected(_homography(values), straight - self.centre)
 
-    def to_px(self, points: FloatArray) -> FloatArray:
-        """Return the inverse of `to_mm` at points (N, 2) of the plane, px.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            Points on the plane, mm.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            Points (x, y) of the image, px.
-        """
+    def to_px(self, points: FloatArray) -> FloatArray:  # noqa: D102
         values = self.parameters
-        back = np.linalg.inv(np.r_[values[8:], 1.0].reshape(3, 3))
-        homogeneous = np.c_[points, np.ones(len(points))] @ back.T
-        straight = homogeneous[:, :2] / homogeneous[:, 2:] + self.centre
+        inverse = np.asarray(np.linalg.inv(_homography(values)), dtype=np.float64)
+        straight = _projected(inverse, points) + self.centre
         return straight if self.lens is None else distorted(values[:8], straight)
 
-    def jacobian(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of `to_mm` by the pixel at points (N, 2): ``[n, mm axis, px axis]``, mm per px.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            Points (x, y) of the image, px.
-
-        Returns
-        -------
-        ndarray, shape (N, 2, 2)
-            In mm per px.
-        """
+    def jacobian(self, points: FloatArray) -> FloatArray:  # noqa: D102
         values = self.parameters
-        lens, homography = values[:8], np.r_[values[8:], 1.0].reshape(3, 3)
+        lens, homography = values[:8], _homography(values)
         straight, bent = points, np.broadcast_to(np.eye(2), (len(points), 2, 2))
         if self.lens is not None:
             straight = undistorted(lens, points)
@@ -225,7 +194,7 @@ class CameraCalibration:
         -------
         ndarray, shape (N, 2, 16)
         """
-        return self._by_parameters(lambda values: self.to_mm(points, values))
+        return self._by_parameters(lambda values: self._to_mm(points, values))
 
     def _by_parameters(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Derivative (..., 16) of a function (...) of the parameters, scaled as `sensitivity` states."""
@@ -281,7 +250,7 @@ class CameraCalibration:
         """Slope (2,) of the plane's normal against the optical axis, with `values` (16,) as parameters."""
         offset = values[1:3] - self.centre
         camera = np.array([[values[0], 0, offset[0]], [0, values[0], offset[1]], [0, 0, 1.0]])
-        back = np.linalg.inv(np.r_[values[8:], 1.0].reshape(3, 3))
+        back = np.linalg.inv(_homography(values))
         first, second = np.linalg.solve(camera, back)[:, :2].T
         normal = np.cross(first, second)
         return np.asarray(normal[:2] / normal[2])

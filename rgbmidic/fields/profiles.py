@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -168,6 +168,7 @@ class ProfileLine:
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.mesh_points = mesh_points.nearby()
+        self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
         nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
         strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
@@ -198,7 +199,7 @@ class ProfileLine:
             NaN where a node around is not measured.
         """
         values, std, bias = (array[self.nodes] for array in np.broadcast_arrays(values, std, bias))
-        weights = _weights(self, np.isfinite(values).tobytes())
+        weights = self._weights(np.isfinite(values).tobytes())
         interpolated = weights @ np.nan_to_num(values)
         variance = self.covariances[kind].variance(np.nan_to_num(weights), std, bias)
         return interpolated, np.where(np.isfinite(interpolated), np.sqrt(variance), np.nan)
@@ -217,17 +218,16 @@ class ProfileLine:
         -------
         ndarray, shape (P, P)
         """
-        weights = np.nan_to_num(_weights(self, np.ones(len(self.nodes), dtype=bool).tobytes()))
+        weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool).tobytes()))
         errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
         return _unit(errors @ errors.T)
 
 
-@lru_cache(maxsize=4)
-def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
+def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:
     """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
     has_data = np.frombuffer(measured, dtype=bool)
-    weights = line.mesh_points.weights(has_data).toarray()
-    weights[~line.mesh_points.measured(has_data)] = np.nan
+    weights = mesh_points.weights(has_data).toarray()
+    weights[~mesh_points.measured(has_data)] = np.nan
     return np.asarray(weights)
 
 

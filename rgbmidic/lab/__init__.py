@@ -1,4 +1,4 @@
-"""The laboratory: virtual experiments, the paper's measures, planning, inspection, the demonstration; its documents."""
+"""The laboratory: virtual experiments, planning, inspection, the demonstration; its documents."""
 
 from __future__ import annotations
 

@@ -35,12 +35,13 @@ FILES = ("resolution.csv", "resolution.json", "resolution.png")
 """Files that `write_study` writes."""
 
 
-def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
+@lru_cache(maxsize=1)  # three tables of a study have the same
+def cut_offs(gauges: tuple[float, ...]) -> tuple[float, float, FloatArray]:
     """Evaluate the spatial resolution of displacement and strain at the nodes, and of virtual strain gauges.
 
     Parameters
     ----------
-    gauges : length G
+    gauges : tuple, length G
         Lengths in elements, three at least.
 
     Returns
@@ -197,11 +198,10 @@ _ERRORS = ("bias", "scatter", "stated", "noise", "discretisation", "total")
 _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float("nan"))
 
 
-@lru_cache(maxsize=1)
 def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
     """Return the figures of every size with their units in their names, cut-offs and gauges included."""
     lengths_in_elements = sorted({gauge.length / size.element_size for size in study.sizes for gauge in size.gauges})
-    displacement_cut_off, strain_cut_off, gauge_cut_offs = cut_offs(lengths_in_elements)
+    displacement_cut_off, strain_cut_off, gauge_cut_offs = cut_offs(tuple(lengths_in_elements))
     cut_off_of = dict(zip(lengths_in_elements, gauge_cut_offs.tolist(), strict=True))
 
     def gauge_figures(gauge: GaugeFigures, side: float) -> dict[str, float]:

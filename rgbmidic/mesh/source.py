@@ -13,16 +13,49 @@ from rgbmidic.typing import FloatArray, IntArray
 
 
 class Plane(Protocol):
-    """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`."""
+    """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`, and `Placement` of a mesh."""
 
     def to_mm(self, points: FloatArray) -> FloatArray:
-        """Return mm on the plane (N, 2) of points (N, 2) in px."""
+        """Return where points of the image lie on the plane.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px; NaN stays NaN.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In mm, in the axes of the plane.
+        """
 
     def to_px(self, points: FloatArray) -> FloatArray:
-        """Return px of points (N, 2) in mm on the plane."""
+        """Return the inverse of `to_mm`.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points of the plane, mm.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+        """
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mm axis, px axis]``."""
+        """Return the derivative of `to_mm` by the pixel: ``[n, mm axis, px axis]``.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 2)
+            In mm per px.
+        """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

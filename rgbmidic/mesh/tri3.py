@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
+from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
@@ -29,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 @state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tri3Mesh:
+class Tri3Mesh(Derivable):
     """Triangles on the reference image. Its arrays are not writable, because derived quantities are cached.
 
     Attributes

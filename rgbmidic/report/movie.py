@@ -55,16 +55,11 @@ class MovieConstants:
         Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms.
     outside_grey
         Grey level outside the image, as in the viewer's light page.
-    patience
-        Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px
-        takes .5 s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others
-        may compute.
     """
 
     sample_size: int = 4_000_000
     min_frames_per_process: int = 100
     outside_grey: int = 235
-    patience: float = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -267,10 +262,9 @@ def write_movie(
     if not 0.1 <= fps <= 240:
         raise InputError(f"a movie has .1 to 240 frames per second, not {fps:g}")
     check_file(out, overwrite=overwrite)
-    frame_indices, constants = movie.frame_indices, movie.constants
-    canvas = _Canvas(movie)
+    frame_indices, canvas = movie.frame_indices, _Canvas(movie)
     exe = "" if ending == ".gif" else str(import_optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
-    process_count = max(1, min(processes, len(frame_indices) // constants.min_frames_per_process))
+    process_count = max(1, min(processes, len(frame_indices) // movie.constants.min_frames_per_process))
 
     def pages() -> Iterator[Page]:
         for done, page in enumerate(_pages(canvas, frame_indices, process_count), 1):
@@ -280,7 +274,7 @@ def write_movie(
 
     if exe:
         encoder = [exe, *_ENCODERS[ending].split()]
-        write_complete(out, lambda file: encode_video(file, pages(), fps, encoder, constants.patience))
+        write_complete(out, lambda file: encode_video(file, pages(), fps, encoder))
     else:
         samples = [*canvas.mixtures(), *(canvas.page(frame) for frame in select_evenly(frame_indices, 3))]
         write_complete(out, lambda file: write_gif(file, pages(), fps, samples))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from functools import partial
 from itertools import chain
 from pathlib import Path
-from threading import Event, Timer
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +23,8 @@ PALETTE = 256
 """Colours of a GIF, and of a field."""
 
 
-def encode_video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str], patience: float) -> None:
-    """Encode pages by ffmpeg; one that neither takes a page nor ends for so many seconds is ended.
-
-    It gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL.
-    """
+def encode_video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str]) -> None:
+    """Encode pages by ffmpeg, which gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL."""
     first_page, path = next(pages), Path(file.name).absolute()
     rows, columns = first_page.shape[:2]
     exe, *options = encoder
@@ -38,40 +33,22 @@ def encode_video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: lis
     command = [exe, "-y", "-loglevel", "error", *source, *padding, *options, str(path)]
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors, start_new_session=True)
-        pipe, late = process.stdin, Event()
+        pipe = process.stdin
         assert pipe is not None
-
-        def kill() -> None:
-            late.set()
-            process.kill()
-
         try:
             with suppress(BrokenPipeError):  # it says why on stderr
                 for page in chain([first_page], pages):
-                    _call_with_timeout(patience, partial(pipe.write, page.tobytes()), kill)
-                _call_with_timeout(patience, pipe.close, kill)
-            status = _call_with_timeout(patience, process.wait, kill)
+                    pipe.write(page.tobytes())
+                pipe.close()
+            status = process.wait()
         finally:
             process.kill()
             process.wait()
         errors.seek(0)
         error_lines = errors.read().decode(errors="replace").strip().splitlines()
-    if late.is_set():
-        raise ResultError(f"ffmpeg could not write the movie: {exe} did nothing for {patience:g} s and was ended")
     if status != 0 or not path.stat().st_size:
         reason = error_lines[-1] if error_lines else f"it ended with status {status} and {path.stat().st_size} bytes"
         raise ResultError(f"ffmpeg could not write the movie: {reason}")
-
-
-def _call_with_timeout(seconds: float, function: Callable[[], Any], on_timeout: Callable[[], object]) -> Any:
-    """Call `function`; call `on_timeout`, which ends it, if it takes longer than `seconds`."""
-    timer = Timer(seconds, on_timeout)
-    timer.daemon = True  # an interrupted program does not wait for it
-    try:
-        timer.start()
-        return function()
-    finally:
-        timer.cancel()
 
 
 def write_gif(file: BinaryIO, pages: Iterator[Page], fps: float, samples: list[Page]) -> None:

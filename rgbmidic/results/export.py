@@ -1,4 +1,4 @@
-"""A result in other programs' formats: npz, csv, nodemaps for CrackPy, and HDF5 for h5py, MATLAB, xarray and ParaView.
+"""A result in other programs' formats: npz, csv, and HDF5 for h5py, MATLAB, xarray and ParaView.
 
 The arrays of the HDF5 file lie at the root, as netCDF has it: uncompressed, the frames as first axis, every axis named
 by a dimension scale, the units as attributes. The group ``/VTKHDF`` (Kitware's VTKHDF 2.0, temporal unstructured grid)
@@ -11,22 +11,19 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from rgbmidic._version import __version__
 from rgbmidic.arguments import checked
-from rgbmidic.errors import InputError, ResultError
+from rgbmidic.errors import InputError
 from rgbmidic.fields.units import column
-from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
-from rgbmidic.results.quantities import FAILED, MESH_LABELS, QUANTITIES, SHARED
+from rgbmidic.results.files import check_file, write_complete, write_table
+from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
@@ -204,7 +201,7 @@ def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, flip_sign: bool) -
 def export_result(
     result: Result, to: str, out: Path | str, *, scale: ScaleSettings | None = None, overwrite: bool = False
 ) -> None:
-    """Write all frames of a result into one file, for CrackPy into a folder.
+    """Write all frames of a result into one file.
 
     ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,), of a mesh of ``mesh.file``
     node_number (N,), element_number (E,) and node_mm (N, 2), and every quantity of
@@ -212,10 +209,7 @@ def export_result(
     ``"csv"`` and ``"hdf5"`` are for engineers: seconds, millimetres where the scale is known, Green-Lagrange
     strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and a row per node
     and frame with the quantities that are one number per node.
-    ``"crackpy"`` is a folder of nodemaps, one text file for each frame that did not fail, for CrackPy (Strohmann et al,
-    DLR): number of the node from 1, x, y, z, u, v, w in mm, strain in x and y in %, tensor shear, y up.
-    x is to the right, y down (up in nodemaps and in ParaView's part of hdf5); NaN (an empty field in csv) where not
-    measured.
+    x is to the right, y down (up in ParaView's part of hdf5); NaN (an empty field in csv) where not measured.
 
     Parameters
     ----------
@@ -224,7 +218,7 @@ def export_result(
     to
         One of `EXPORT_FORMATS`.
     out
-        File to write, or folder of nodemaps; a file appears once it is complete.
+        File to write; it appears once it is complete.
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one. npz is in px in any case.
     overwrite
@@ -233,9 +227,9 @@ def export_result(
     Raises
     ------
     InputError
-        The format is unknown, or nodemaps are asked for where the scale is not known.
+        The format is unknown.
     ResultError
-        The file exists, the folder of nodemaps is not empty, its folder does not, or a frame of the result is damaged.
+        The file exists, its folder does not, or a frame of the result is damaged.
 
     Examples
     --------
@@ -246,9 +240,6 @@ def export_result(
     out = Path(out)
     if to not in EXPORT_FORMATS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    if to == "crackpy":
-        _write_nodemaps(ResultInUnits.from_result(result, scale), out, overwrite=overwrite)
-        return
     check_file(out, overwrite=overwrite)
     physical = ResultInUnits.from_result(result, scale)
     write_complete(out, lambda file: _WRITERS[to](physical, file))
@@ -305,49 +296,10 @@ def _write_csv(physical: ResultInUnits, file: BinaryIO) -> None:
     write_table(file, head, rows())
 
 
-_NODEMAP = ("id", "x [mm]", "y [mm]", "z [mm]", "u [mm]", "v [mm]", "w [mm]", "eps_x [%]", "eps_y [%]", "eps_xy [1]")
-
-
-def _write_nodemaps(physical: ResultInUnits, folder: Path, *, overwrite: bool) -> None:
-    """Write a nodemap of each frame, as CrackPy 1.2 reads them: NAME_NUMBER.txt, with nothing else in the folder."""
-    result = physical.result
-    if physical.units.mm_per_pixel is None:
-        raise InputError(
-            f"nodemaps for CrackPy are in mm, and lengths of {result.path} are in px: state mm_per_pixel or camera in "
-            '[scale], without unit = "px" (`scale`)'
-        )
-    stem = result.path.resolve().name
-    if folder.exists() and not folder.is_dir():
-        raise ResultError(f"{folder} already exists and is no folder; nodemaps need one of their own")
-    with write_errors(folder):
-        present_files = list(folder.iterdir()) if folder.exists() else []
-        foreign_files = [file for file in present_files if not re.fullmatch(rf"{re.escape(stem)}_\d+\.txt", file.name)]
-        if foreign_files or (present_files and not overwrite):
-            raise ResultError(
-                f"{(foreign_files or present_files)[0]} is already there; nodemaps need a folder of their own"
-                + ("" if foreign_files else ", or overwrite them (`overwrite=True`)")
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in present_files:
-            file.unlink()
-    x, y = physical.length * physical.mesh.nodes.T
-    flat = np.zeros(len(x))
-    for index in np.flatnonzero(result.finished & (result.status != FAILED)).tolist():
-        values = physical.frame(index)
-        table = [np.arange(len(x)) + 1, x, -y, flat, values["u"], -values["v"], flat]
-        table += [100 * values["exx"], 100 * values["eyy"], -values["exy"]]
-        title = f"rgbmidic {__version__}, {stem}, {result.names[index]}; {physical.measure} strain"
-        # CrackPy looks for "# time" and such at the beginning of a line, and for the number behind its colon
-        lines = [title, *([f"time : {physical.times[index]:.12g}"] if physical.units.timed else []), ";".join(_NODEMAP)]
-        header = "\n".join(lines).encode("ascii", "backslashreplace").decode()
-        save = partial(np.savetxt, X=np.column_stack(table), fmt="%.9g", delimiter=";", header=header)
-        write_complete(folder / f"{stem}_{values['number']}.txt", save)
-
-
 _WRITERS: dict[str, Callable[[ResultInUnits, BinaryIO], None]] = {
     "npz": _write_npz,
     "csv": _write_csv,
     "hdf5": write_hdf5,
 }
-EXPORT_FORMATS = (*_WRITERS, "crackpy")
+EXPORT_FORMATS = tuple(_WRITERS)
 """Names of the formats that `export_result` writes."""

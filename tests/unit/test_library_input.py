@@ -20,7 +20,6 @@ from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, Sensitivi
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import Quantity
 from rgbmidic.lab.inspection import inspect_frame
-from rgbmidic.lab.measures import areas_along_x, fit_lobe, residual_percent, rms_slope
 from rgbmidic.scene.camera import rotation
 from rgbmidic.scene.scene import State
 from rgbmidic.scene.surface import AffineField, MeshField, Surface, height_map
@@ -128,11 +127,7 @@ MORE_ARGUMENTS: dict[str, Callable[[Any], object]] = {
     "displacement of a mesh": lambda value: MeshField(**FIELD | {"displacement": value}),
     "translation": lambda value: State(translation=value),
     "size of a map": lambda value: height_map(Surface(), size=value, pitch=0.1),
-    "number of areas": lambda value: areas_along_x((0, 0), count=value),
-    "displacement of images": lambda value: residual_percent(TEXTURE, TEXTURE, value),
-    "heights": lambda value: rms_slope(value, np.ones((3, 3), dtype=bool), 0.1),
     "wavelengths": lambda value: Sensitivities(wavelengths=value, values=np.ones((3, 7))),
-    "levels of light": lambda value: fit_lobe(np.arange(7.0), value),
     "white balance": lambda value: write_dng("/dev/null/x", Mosaic(**MOSAIC), white_balance=value),
     **{"file": lambda value: write_dng(value, Mosaic(**MOSAIC)), "mesh": rgbmidic.read_mesh},
 }

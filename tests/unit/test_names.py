@@ -147,10 +147,9 @@ def is_defined(name: str) -> bool:
     path, parts = root, name.split(".")[1:]
     while parts and ((path / parts[0]).is_dir() or (path / f"{parts[0]}.py").is_file()):
         path /= parts.pop(0)
-    source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    return not parts or (
-        re.search(rf"\b{parts[0]}\b", source.read_text(encoding="utf-8")) is not None and set(parts) <= identifiers()
-    )
+    sources = path.glob("__init__.py*") if path.is_dir() else [path.with_suffix(".py")]  # with a stub of lazy names
+    text = "".join(source.read_text(encoding="utf-8") for source in sources)
+    return not parts or (re.search(rf"\b{parts[0]}\b", text) is not None and set(parts) <= identifiers())
 
 
 @pytest.mark.parametrize("room", renamed_rooms())

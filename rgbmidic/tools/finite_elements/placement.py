@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placement:
+class Placement(Plane):
     """Position of a mesh in mm on the image.
 
     Attributes
@@ -159,51 +159,15 @@ class Placement:
         spread = ((self.pairs[:, 2:] - self.pairs[:, 2:].mean(axis=0)) ** 2).sum()
         return float(self.mm_per_pixel * np.sqrt((self.residuals**2).sum() / free / spread))
 
-    def to_px(self, points: FloatArray) -> FloatArray:
-        """Return where points (N, 2) of the mesh, in mm, lie on the image, px.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            Points of the mesh, mm.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            Points (x, y) of the image, px.
-        """
+    def to_px(self, points: FloatArray) -> FloatArray:  # noqa: D102
         positions = points @ self.matrix.T + self.shift
         return positions if self.camera is None else self.camera.to_px(positions)
 
-    def to_mm(self, points: FloatArray) -> FloatArray:
-        """Return points (N, 2) of the image, in px, in mm in the mesh's axes.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            Points (x, y) of the image, px.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            In mm.
-        """
+    def to_mm(self, points: FloatArray) -> FloatArray:  # noqa: D102
         positions = points if self.camera is None else self.camera.to_mm(points)
         return np.asarray((positions - self.shift) @ np.linalg.inv(self.matrix).T)
 
-    def jacobian(self, points: FloatArray) -> FloatArray:
-        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2)
-            Points (x, y) of the image, px.
-
-        Returns
-        -------
-        ndarray, shape (N, 2, 2)
-            In mm per px.
-        """
+    def jacobian(self, points: FloatArray) -> FloatArray:  # noqa: D102
         inverse = np.linalg.inv(self.matrix)
         if self.camera is None:
             return np.broadcast_to(inverse, (len(points), 2, 2)).copy()

@@ -110,7 +110,7 @@ def test_a_test_that_shows_nothing_is_refused(command, test_file, change, text):
 
 
 def test_the_spatial_resolution_is_that_of_a_wave_measured_on_the_mesh():
-    displacement, strain, gauges = cut_offs([3, 5, 8, 12, 30])
+    displacement, strain, gauges = cut_offs((3, 5, 8, 12, 30))
     assert 2 < displacement < 3 < strain < gauges[0]
     np.testing.assert_allclose(displacement, ReportConstants().finest_nodes, rtol=0.03)  # what a report states
     np.testing.assert_allclose(gauges / [3, 5, 8, 12, 30], ReportConstants().finest_gauge, rtol=0.06)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import pickle
 import re
+from weakref import ref
 
 import naive_mesh
 import numpy as np
@@ -249,3 +250,21 @@ def test_too_small_regions_and_elements_are_refused():
     line[20, 10:60] = True
     with pytest.raises(RegionError, match="too small"):
         Tri3Mesh.from_region(Region.from_mask(line), 25)
+
+
+def test_what_is_derived_from_a_mesh_is_kept_with_it_and_freed_with_it():
+    mesh, calls = Tri3Mesh.from_region(Region.from_rectangle((2, 2, 40, 40), (50, 50)), 12), []
+
+    def areas(of: Tri3Mesh, active: bytes) -> np.ndarray:
+        calls.append(active)
+        return of.areas * np.frombuffer(active, dtype=bool)
+
+    every, other = (np.arange(len(mesh.elements)) >= first for first in (0, 1))
+    halved = Tri3Mesh(nodes=mesh.nodes, elements=mesh.elements)
+    for one in (mesh, halved, mesh):  # neither mesh nor mask drives out the other
+        for active in (every, other, every):
+            np.testing.assert_array_equal(one.derive(areas, active.tobytes()), mesh.areas * active)
+    assert len(calls) == 4
+    result = ref(halved.derive(areas, every.tobytes()))
+    del halved, one
+    assert result() is None  # at once: no cycle waits for the collection of garbage

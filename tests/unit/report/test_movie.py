@@ -18,9 +18,9 @@ from results import NODES, make_result, smooth_record
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
-from rgbmidic.report import movie, video
+from rgbmidic.report import movie
 from rgbmidic.report.curves import Curve
-from rgbmidic.report.movie import FieldMovie, MovieConstants, _Canvas, write_movie
+from rgbmidic.report.movie import FieldMovie, _Canvas, write_movie
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
 
@@ -148,23 +148,20 @@ def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Pa
     ("does", "told"),
     [
         ("cat > /dev/null", "it ended with status 0 and 0 bytes"),
-        ("exec sleep 600", "did nothing for 0.2 s and was ended"),
-        ("cat > /dev/null; exec sleep 600", "did nothing for 0.2 s and was ended"),
         ("cat > /dev/null; echo no codec >&2; exit 3", "no codec"),
         ("exit 3", "it ended with status 3"),
     ],
 )
 def test_an_ffmpeg_that_does_not_do_its_work_is_an_error_and_nothing_is_left(
-    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, does: str, told: str
+    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str, told: str
 ) -> None:
     exe, out = tmp_path / "ffmpeg", tmp_path / "out"
     exe.write_text(f"#!/bin/sh\n{does}\n")
     exe.chmod(0o700)
     out.mkdir()
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(exe))
-    constants = MovieConstants(patience=0.2 if "sleep" in does else 300.0)
     with pytest.raises(ResultError, match=told):
-        write_movie(FieldMovie(maps=maps, fields=["u"], width=320, constants=constants), out / "m.mp4")
+        write_movie(FieldMovie(maps=maps, fields=["u"], width=320), out / "m.mp4")
     assert not list(out.iterdir())
 
 
@@ -193,25 +190,6 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
     assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130
     assert signal.getsignal(signal.SIGTERM) is before
     assert not list(tmp_path.iterdir())
-
-
-def test_an_interruption_while_its_timer_starts_ends_the_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    timers: list[video.Timer] = []
-
-    class Interrupted(video.Timer):
-        def start(self) -> None:
-            super().start()
-            timers.append(self)
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(video, "Timer", Interrupted)
-    pages = iter([np.zeros((2, 2, 4), dtype=np.uint8)] * 2)
-    with (tmp_path / "m.mp4").open("wb") as file, pytest.raises(KeyboardInterrupt):
-        video.encode_video(file, pages, 25.0, ["cat"], 300.0)
-    for timer in timers:
-        timer.join(10)
-    assert timers
-    assert not any(timer.is_alive() for timer in timers)
 
 
 def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path: Path) -> None:

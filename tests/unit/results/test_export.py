@@ -21,7 +21,6 @@ from rgbmidic.results import (
     ResultStore,
     export_result,
 )
-from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
 
@@ -131,65 +130,3 @@ def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) 
         with pytest.raises(ResultError, match="damaged"):
             export_result(Result.open(result.path), to, tmp_path / "b")
     assert [file.name for file in tmp_path.iterdir()] == ["result"]
-
-
-def test_nodemaps_are_those_that_crackpy_reads(result: Result, tmp_path: Path) -> None:
-    scale = ScaleSettings(mm_per_pixel=0.05, frame_rate=1000)
-    out = tmp_path / "nodemaps"
-    export_result(result, "crackpy", out, scale=scale)
-    assert sorted(file.name for file in out.iterdir()) == ["result_0.txt", "result_1.txt", "result_2.txt"]
-    physical = ResultInUnits.from_result(result, scale)
-    table = np.genfromtxt(out / "result_2.txt", delimiter=";")
-    values = physical.frame(2)
-    x, y = 0.05 * result.nodes.T
-    zero = np.zeros(NODES)
-    expected = [np.arange(NODES) + 1, x, -y, zero, values["u"], -values["v"], zero]
-    expected += [100 * values["exx"], 100 * values["eyy"], -values["exy"]]
-    np.testing.assert_allclose(table.T, expected, rtol=1e-6, atol=1e-9)
-    lines = (out / "result_2.txt").read_text(encoding="ascii").splitlines()
-    assert f"# time : {physical.times[2]:.12g}" in lines
-    assert not any(line.startswith(("# x", "# force", "# displacement")) for line in lines)  # words CrackPy looks for
-
-
-def test_nodemaps_have_a_folder_and_millimetres_of_their_own(result: Result, tmp_path: Path) -> None:
-    scale, out = ScaleSettings(mm_per_pixel=0.05), tmp_path / "a" / "nodemaps"
-    with pytest.raises(InputError, match=r"are in mm, and lengths of .* are in px: .* mm_per_pixel or camera"):
-        export_result(result, "crackpy", out)
-    assert not out.parent.exists()
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(ResultError, match=r"file already exists and is no folder"):
-        export_result(result, "crackpy", tmp_path / "file", scale=scale, overwrite=True)
-    export_result(result, "crackpy", out, scale=scale)
-    with pytest.raises(ResultError, match=r"result_\d.txt is already there; .*`overwrite=True`"):
-        export_result(result, "crackpy", out, scale=scale)
-    (out / "result_99.txt").write_text("of a longer test before")
-    export_result(result, "crackpy", out, scale=scale, overwrite=True)
-    assert not (out / "result_99.txt").exists()
-    (out / "notes.txt").write_text("mine")
-    with pytest.raises(ResultError, match=r"notes.txt is already there; nodemaps need a folder of their own$"):
-        export_result(result, "crackpy", out, scale=scale, overwrite=True)
-    assert len(list(out.iterdir())) == 4
-
-
-def test_crackpy_reads_the_nodemaps(result: Result, tmp_path: Path) -> None:
-    reader = pytest.importorskip("crackpy.fracture_analysis.data_processing", reason="pip install crackpy")
-    from crackpy.structure_elements.data_files import Nodemap
-
-    scale, out = ScaleSettings(mm_per_pixel=0.05, frame_rate=1000), tmp_path / "nodemaps"
-    export_result(result, "crackpy", out, scale=scale)
-    read = reader.InputData(Nodemap(name="result_1.txt", folder=str(out)))
-    values = ResultInUnits.from_result(result, scale).frame(1)
-    known = np.isfinite(values["exx"] + values["u"])  # CrackPy leaves rows with a NaN out
-    assert known.any()
-    x, y = 0.05 * result.nodes[known].T
-    for name, expected in {
-        "coor_x": x,
-        "coor_y": -y,
-        "disp_x": values["u"][known],
-        "disp_y": -values["v"][known],
-        "eps_x": values["exx"][known],
-        "eps_y": values["eyy"][known],
-        "eps_xy": -values["exy"][known],
-    }.items():
-        np.testing.assert_allclose(getattr(read, name), expected, rtol=1e-6, atol=1e-9, err_msg=name)
-    assert read.time == pytest.approx(ResultInUnits.from_result(result, scale).times[1])

@@ -242,7 +242,7 @@ def test_json_that_cannot_be_read_is_told(copy: Path, text: str) -> None:
         Result.open(copy)
 
 
-@pytest.mark.parametrize("to", [to for to in EXPORT_FORMATS if to != "crackpy"])
+@pytest.mark.parametrize("to", EXPORT_FORMATS)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_export_to_a_full_disk_is_told(result: Result, tmp_path: Path, to: str) -> None:
     part = f"fields.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.part"

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from measures import Lobe
 from rgbmidic.errors import InputError
-from rgbmidic.lab.measures import Lobe
 from rgbmidic.lab.virtual import Camera, Finish, Light, Sphere, Surface
 from rgbmidic.lab.virtual.rendering import plate_scene, sphere_scene
 from rgbmidic.scene.geometry_weights import angle_weights, surface_from_heights

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from measures import fit_lobe, goniometry, pixel_levels
 from rgbmidic.errors import InputError
-from rgbmidic.lab.measures import fit_lobe, goniometry, pixel_levels
 
 ANGLES = np.arange(-45.0, 90.5, 1.5)
 

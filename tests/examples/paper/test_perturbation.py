@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from measures import MeasureArea, area_means, area_stds, areas_along_x, perturbation, residual_percent
 from rgbmidic.errors import InputError
 from rgbmidic.fields import high_pass
-from rgbmidic.lab.measures import MeasureArea, area_means, area_stds, areas_along_x, perturbation, residual_percent
 
 SHAPE = (300, 420)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields import SIGMA, high_pass
 from rgbmidic.typing import BoolArray, FloatArray
@@ -74,7 +73,6 @@ class MeasureArea:
         return image[..., int(np.ceil(y0)) : int(y1) + 1, int(np.ceil(x0)) : int(x1) + 1]
 
 
-@checked
 def areas_along_x(
     first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
 ) -> tuple[MeasureArea, ...]:
@@ -100,7 +98,6 @@ def areas_along_x(
     return tuple(MeasureArea(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
 
 
-@checked
 def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: float = SIGMA) -> FloatArray:
     """Perturbation P (paper, section 2.2): standard deviation in each area of a displacement without its long waves.
 
@@ -126,7 +123,6 @@ def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: f
     return area_stds(high_pass(field, sigma), areas)
 
 
-@checked
 def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
     """Return the residual of a measurement in % of the effective dynamic range (paper, section 2.2).
 
@@ -175,7 +171,6 @@ def _area_statistics(image: FloatArray, areas: Sequence[MeasureArea], statistic:
     return np.array([statistic(cut) if np.isfinite(cut).mean() >= 0.5 else np.nan for cut in cuts], dtype=np.float64)
 
 
-@checked
 def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
     """Return the standard deviation of an image in each area.
 
@@ -194,7 +189,6 @@ def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArr
     return _area_statistics(high_passed, areas, np.nanstd)
 
 
-@checked
 def area_means(field: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
     """Return the mean of an image in each area.
 
@@ -266,7 +260,6 @@ class Goniometry:
     band: tuple[float, float]
 
 
-@checked
 def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> FloatArray:
     """Return the grey levels (n, m) of chosen pixels in n frames.
 
@@ -299,7 +292,6 @@ def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> Floa
     return np.array(levels)
 
 
-@checked
 def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     """Fit a diffuse part and a specular lobe to grey levels.
 
@@ -338,7 +330,6 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     return Lobe(diffuse=diffuse, specular=specular, centre_deg=centre, width_deg=width, std=(a, b, c, d))
 
 
-@checked
 def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, min_spread: float = 0.05) -> Goniometry:
     """Return the diffuse light, specular lobe and erratic band of a series of grey levels.
 
@@ -413,7 +404,6 @@ def _lobe(angles: FloatArray, diffuse: float, specular: float, centre: float, wi
     return np.asarray(diffuse * lambert + specular * np.exp(-((angles - centre) ** 2) / (2 * width**2)))
 
 
-@checked
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
     """Return a height map minus the best bipolynomial: all x^i y^j with i and j up to `order` (paper, Fig. 10: 4).
 
@@ -451,7 +441,6 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
     return np.asarray(values - along_y @ coefficients @ along_x.T)
 
 
-@checked
 def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
     """Return the local slope arctan|grad h| by central differences.
 
@@ -476,7 +465,6 @@ def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
     return np.asarray(np.degrees(np.arctan(np.hypot(along_x, along_y))))
 
 
-@checked
 def slope_uncertainty(height_std: float, pitch: float) -> float:
     """Return the standard uncertainty of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
 
@@ -501,7 +489,6 @@ def _check_pitch(pitch: float) -> None:
         raise InputError(f"the pitch of a height map is positive, not {pitch!r}")
 
 
-@checked
 def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
     """Classify white and black paint of an intensity map, by Otsu's threshold.
 
@@ -530,7 +517,6 @@ def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
     return np.asarray(is_measured & (grey > level))
 
 
-@checked
 def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
     """Return the root mean square local slope of one paint in degrees, measurement noise taken off.
 
@@ -567,7 +553,6 @@ def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, heigh
     return math.degrees(math.atan(math.sqrt(max(square, 0))))
 
 
-@checked
 def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.06) -> tuple[float, float]:
     """Return the distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from measures import detrend, local_slope, paint_classes, rms_slope, slope_uncertainty, wrinkle_spacing
 from rgbmidic.errors import InputError
-from rgbmidic.lab.measures import detrend, local_slope, paint_classes, rms_slope, slope_uncertainty, wrinkle_spacing
 
 PITCH = 5.0
 Y, X = np.mgrid[:240, :260] * PITCH
