@@ -113,7 +113,7 @@ def _separated(
     model = reconstruct(
         linear, crosstalk, registration=calibration.registration, texture=texture, mixing=mixing, tables=tables
     )
-    return reconstructed_lights(model, crosstalk, are_lights=mixing is not None)
+    return reconstructed_lights(model, crosstalk, is_mixed=mixing is None)
 
 
 @checked
@@ -159,7 +159,7 @@ def demosaic(
     return reconstruct(linear, crosstalk, texture=texture).channels
 
 
-def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, are_lights: bool = False) -> IlluminationImages:
+def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, is_mixed: bool = True) -> IlluminationImages:
     """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels.
 
     The channels are unmixed, unless what the method gives are the lights already. The index, on the blocks' grid, is
@@ -179,7 +179,7 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, are_lig
         "texture": model.texture,
     }
     channels = model.channels
-    if not are_lights:
+    if is_mixed:
         return replace(unmix(channels, crosstalk), **diagnostics)
     return IlluminationImages(
         values=channels.values,
