@@ -164,7 +164,8 @@ class Plan:
     ) -> Plan:
         """Read all that the settings name, except the deformed frames.
 
-        Objects take the place of what the settings name; with any of them frames are read whole.
+        Objects take the place of what the settings name; with a source, weights, or a mesh without its region, frames
+        are read whole.
 
         Parameters
         ----------
@@ -201,7 +202,7 @@ class Plan:
             plane.check(frame)
             plane.check_light(None if calibration is None else calibration.registration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        has_objects = any(item is not None for item in (source, weights, mesh, region))
+        has_objects = source is not None or weights is not None or (mesh is not None and region is None)
         finite_elements, placement = None, None
         if settings.mesh.file is not None:
             finite_elements, placement, mesh, region = finite_elements_of(settings, frame)

@@ -1,0 +1,223 @@
+"""From both cameras' displacements of one frame to the motion of the surface in space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.results import Result
+from rgbmidic.tools.stereo.axes import Axes, AxesChoice
+from rgbmidic.tools.stereo.camera_pair import CameraPair
+from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
+from rgbmidic.tools.stereo.surface import SurfaceGauges
+from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
+from rgbmidic.typing import AnyArray, FloatArray
+
+_EXACT = 1e-4
+"""Standard uncertainty (px) of what is exact by definition: a node in the left reference, a frame that is the only
+reference. Weights stay finite; it is a tenth of the smallest that is stated of a match."""
+_CORRELATED = 200
+"""Nodes in which the part of the calibration is taken: it is smooth over the frame (lens and pose)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StereoLimits:
+    """Limits of the epipolar residual from which a stereo result warns.
+
+    Attributes
+    ----------
+    residual
+        rms (px) up to which nothing is reported: a sound calibration of a real rig left .05 px (prototype, Stereo-DIC
+        Challenge 1.0, sample 3), which moves the shape by as many px.
+    factor
+        The same over the stated uncertainty.
+    """
+
+    residual: float = 0.06
+    factor: float = 3.0
+
+
+LIMITS = StereoLimits()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shape:
+    """The undeformed surface, and what every frame needs of it.
+
+    Attributes
+    ----------
+    pair, carried
+        Cameras, and the mesh in both frames.
+    triangulation
+        Of the reference states, left camera's axes.
+    axes
+        In which results are.
+    points, covariance : ndarray, shapes (N, 3) and (N, 3, 3)
+        The surface in these axes, mm, and its covariance by the match of the references.
+    gauges
+        Of the surface strain.
+    calibration_std : ndarray, shape (2,)
+        Relative standard uncertainty of lengths on the surface, and standard uncertainty (px, rms) of the epipolar
+        residual, that the calibration leaves.
+    """
+
+    pair: CameraPair
+    carried: CarriedMesh
+    triangulation: Triangulation
+    axes: Axes
+    points: FloatArray
+    covariance: FloatArray
+    gauges: SurfaceGauges
+    calibration_std: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        pair: CameraPair,
+        carried: CarriedMesh,
+        *,
+        axes: AxesChoice = "plane",
+        gauge: float | None = None,
+        measure: str = "green-lagrange",
+    ) -> Shape:
+        """Triangulate the reference states.
+
+        Parameters
+        ----------
+        pair, carried
+            Cameras, and the mesh in both frames.
+        axes
+            As of `Axes.of`.
+        gauge
+            Length of the virtual strain gauges in px of the left frame; None: the shortest.
+        measure
+            Strain measure.
+
+        Returns
+        -------
+        Shape
+
+        Raises
+        ------
+        InputError
+            A node lies where a lens has no inverse or behind a camera, or axes and gauge are not possible.
+        """
+        exact = np.full_like(carried.right_std, _EXACT)
+        spread = _diagonal(exact, np.maximum(carried.right_std, _EXACT))
+        pixels = carried.left.nodes, carried.right.nodes
+        shape = triangulate(pair, *pixels, spread)
+        if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
+            raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
+        chosen = Axes.of(axes, carried.left, shape.points)
+        points = chosen.points(shape.points)
+        some = slice(None, None, len(points) // _CORRELATED + 1)
+
+        def uncertain(other: CameraPair) -> FloatArray:
+            seen = triangulate(other, pixels[0][some], pixels[1][some], spread[some])
+            extent = np.linalg.norm(seen.points - seen.points.mean(axis=0), axis=1)
+            return np.asarray(np.r_[np.log(np.sqrt(np.mean(extent**2))), seen.residual])
+
+        errors = pair.sensitivity(uncertain)
+        scale_std, residual_std = np.linalg.norm(errors[0]), np.sqrt((errors[1:] ** 2).sum(axis=1).mean())
+        return cls(
+            pair=pair,
+            carried=carried,
+            triangulation=shape,
+            axes=chosen,
+            points=points,
+            covariance=chosen.covariance(shape.covariance),
+            gauges=SurfaceGauges.around_nodes(carried.left, points, gauge, measure),
+            calibration_std=np.array([scale_std, residual_std]),
+        )
+
+    def frame(self, left: Mapping[str, Any], right: Mapping[str, Any]) -> dict[str, AnyArray]:
+        """Compute what a frame shows of the surface.
+
+        Parameters
+        ----------
+        left, right
+            ``u``, ``v``, ``u_std``, ``v_std`` and ``node_status`` of the N nodes of the carried mesh in either test.
+
+        Returns
+        -------
+        dict
+            Quantities of `rgbmidic.tools.stereo.result.QUANTITIES` that a frame has, by name.
+        """
+        moved, stds = (
+            [np.stack([side[f"u{end}"], side[f"v{end}"]], axis=1, dtype=np.float64) for side in (left, right)]
+            for end in ("", "_std")
+        )
+        spread = _diagonal(*stds)
+        floored = np.where(np.isfinite(spread), spread, 1.0) + _EXACT**2 * np.eye(4)
+        weights = np.asarray(np.linalg.inv(floored), dtype=np.float64)
+        nodes = self.carried.left.nodes, self.carried.right.nodes
+        deformed = triangulate(self.pair, nodes[0] + moved[0], nodes[1] + moved[1], spread, weights)
+        # with the same weights: the error of the shape is in both, and cancels in their difference
+        reference = triangulate(self.pair, *nodes, spread, weights)
+        displacement = (deformed.points - reference.points) @ self.axes.rotation.T
+        covariance = self.axes.covariance(deformed.covariance)
+        strain, normal = self.gauges.strain(displacement, covariance)
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        values: dict[str, AnyArray] = {
+            "displacement_covariance": covariance,
+            "epipolar_change": deformed.residual - reference.residual,
+            "epipolar_change_std": deformed.residual_std,
+            "normal": normal,
+            "direction": strain.direction_deg,
+            "direction_std": strain.direction_std_deg,
+            "left_status": np.asarray(left["node_status"]),
+            "right_status": np.asarray(right["node_status"]),
+        }
+        for names, array, error in (
+            ("uvw", displacement, std),
+            (("exx", "eyy", "exy"), strain.components, strain.components_std),
+            (("e1", "e2"), strain.principal, strain.principal_std),
+        ):
+            for column, name in enumerate(names):
+                values |= {name: array[:, column], f"{name}_std": error[:, column]}
+        return values
+
+    def doubts(self, changes: FloatArray, stated: FloatArray) -> Iterator[str]:
+        """Yield warnings about the epipolar residual.
+
+        Parameters
+        ----------
+        changes, stated : ndarray, shape (T,)
+            rms over the nodes of its change since the reference in each frame, and of what is stated of it, px.
+
+        Yields
+        ------
+        str
+        """
+        shape = self.triangulation
+        common = float(np.sqrt(np.mean(shape.residual**2)))
+        expected = float(np.sqrt(np.mean(shape.residual_std**2) + self.calibration_std[1] ** 2))
+        if common > max(LIMITS.residual, LIMITS.factor * expected):
+            yield (
+                f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {expected:.3f} px: the "
+                f"cameras do not stand as {self.pair.name} states, and shape and displacement are off by as many px: "
+                "calibrate again (rgbmidic-calibrate stereo)"
+            )
+        off = np.flatnonzero(changes > np.maximum(LIMITS.residual, LIMITS.factor * stated))
+        if len(off):
+            worst = off[np.argmax(changes[off])]
+            yield (
+                f"the epipolar residual changes in {len(off)} frames, by {changes[worst]:.3f} px rms in frame {worst} "
+                f"where {stated[worst]:.3f} px are stated: a camera moved or the frames of both cameras were not taken "
+                "at one time"
+            )
+
+
+def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:
+    """Read what `Shape.frame` needs of some nodes of a frame."""
+    values = result.frame(frame).values
+    return {name: np.asarray(values[name])[nodes] for name in ("u", "v", "u_std", "v_std", "node_status")}
+
+
+def _diagonal(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return covariances (N, 4, 4) of independent coordinates with standard uncertainties (N, 2) in either frame."""
+    return np.asarray(np.concatenate([left, right], axis=1)[:, :, None] ** 2 * np.eye(4))
