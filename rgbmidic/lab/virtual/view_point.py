@@ -14,7 +14,7 @@ from rgbmidic.scene.camera import Vector, rotation
 from rgbmidic.scene.scene import Body, Scene, State
 from rgbmidic.scene.zones import material_points, points_and_normals
 from rgbmidic.tools.stereo import CameraPair
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import AnyArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,7 +62,7 @@ class ViewPoint:
         -------
         Scene
         """
-        positions = [self.rotation @ light.position + self.translation for light in scene.lights]
+        positions = [self.rotation @ np.array(light.position) + self.translation for light in scene.lights]
         lights = zip(scene.lights, positions, strict=True)
         return replace(scene, lights=tuple(replace(light, position=_vector(place)) for light, place in lights))
 
@@ -97,11 +97,11 @@ class ViewPoint:
             axis=_vector(vector) if angle else (0.0, 1.0, 0.0),
             pivot=body.centre,
             translation=_vector(self.rotation @ origin + self.translation - body.centre),
-            velocity=_vector(self.rotation @ state.velocity),
+            velocity=_vector(self.rotation @ np.array(state.velocity)),
         )
 
 
-def _vector(values: FloatArray) -> Vector:
+def _vector(values: AnyArray) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
 

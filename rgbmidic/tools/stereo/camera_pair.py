@@ -140,7 +140,8 @@ class CameraPair:
         ndarray, shape (..., 22)
         """
         values, scale = self.parameters, np.sqrt(np.diag(self.covariance))
-        relative = self.covariance / np.where(scale > 0, np.outer(scale, scale), 1.0)
+        product = np.outer(scale, scale)
+        relative = np.divide(self.covariance, product, out=np.zeros_like(product), where=product > 0)
         variances, vectors = np.linalg.eigh(relative)
         slopes = [
             (function(self.with_parameters(values + step)) - function(self.with_parameters(values - step))) / 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
@@ -31,32 +31,33 @@ if TYPE_CHECKING:
 STEREO_FILE = "stereo.h5"
 _SCHEMA, _VERSION = "rgbmidic-stereo-result", 1
 _NODE, _STATUS = ("node",), ("measured", "not seen", "decorrelated", "filled")
+_DOUBLE: dict[str, Any] = {"dtype": np.float64}
 
 
-def _with_std(names: Iterable[str], unit: str, text: str, axes: tuple[str, ...]) -> list[ResultQuantity]:
-    values = [ResultQuantity(name, axes, unit, "", text.format(name), symbol=name) for name in names]
-    return [entry for value in values for entry in (value, value.uncertainty)]
+def _with_std(names: Iterable[str], unit: str, text: str, **changes: Any) -> list[ResultQuantity]:
+    values = [ResultQuantity(name, _NODE, unit, "", text.format(name), symbol=name, **changes) for name in names]
+    return [entry for value in values for entry in (value, replace(value.uncertainty, dtype=np.float32))]
 
 
 _SHARED = [
-    ResultQuantity("x_left", _NODE, "px", "", "node in the left reference, to the right"),
-    ResultQuantity("y_left", _NODE, "px", "", "node in the left reference, down"),
-    ResultQuantity("x_right", _NODE, "px", "", "node in the right reference, to the right"),
-    ResultQuantity("y_right", _NODE, "px", "", "node in the right reference, down"),
+    ResultQuantity("x_left", _NODE, "px", "", "node in the left reference, to the right", **_DOUBLE),
+    ResultQuantity("y_left", _NODE, "px", "", "node in the left reference, down", **_DOUBLE),
+    ResultQuantity("x_right", _NODE, "px", "", "node in the right reference, to the right", **_DOUBLE),
+    ResultQuantity("y_right", _NODE, "px", "", "node in the right reference, down", **_DOUBLE),
     ResultQuantity("left_node", _NODE, "", "", "index of the node in the left result", dtype=np.int32),
-    *_with_std("xyz", "mm", "coordinate {} of the undeformed surface", _NODE),
+    *_with_std("xyz", "mm", "coordinate {} of the undeformed surface", **_DOUBLE),
     ResultQuantity("shape_covariance", ("node", 3, 3), "mm^2", "", "covariance of x, y, z by the match of references"),
-    *_with_std(["epipolar_common"], "px", "epipolar residual of the reference states, common to all frames", _NODE),
+    *_with_std(["epipolar_common"], "px", "epipolar residual of the reference states, common to all frames"),
 ]
 """Quantities that all frames share."""
 _OF_FRAMES = [
-    *_with_std("uvw", "mm", "displacement {} of the surface", _NODE),
+    *_with_std("uvw", "mm", "displacement {} of the surface", **_DOUBLE),
     ResultQuantity("displacement_covariance", ("node", 3, 3), "mm^2", "", "covariance of u, v, w"),
-    *_with_std(["exx", "eyy", "exy"], "", "surface strain {} in the tangent plane", _NODE),
-    *_with_std(["e1", "e2"], "", "principal surface strain {}", _NODE),
-    *_with_std(["direction"], "degree", "direction of e1 in the tangent plane, from x towards y", _NODE),
+    *_with_std(["exx", "eyy", "exy"], "", "surface strain {} in the tangent plane"),
+    *_with_std(["e1", "e2"], "", "principal surface strain {}"),
+    *_with_std(["direction"], "degree", "direction of e1 in the tangent plane, from x towards y"),
     ResultQuantity("normal", ("node", 3), "", "", "unit normal of the deformed surface"),
-    *_with_std(["epipolar_change"], "px", "epipolar residual less that of the reference states", _NODE),
+    *_with_std(["epipolar_change"], "px", "epipolar residual less that of the reference states"),
     ResultQuantity("left_status", _NODE, "", "", "node in the left test", dtype=np.uint8, blank=1, codes=_STATUS),
     ResultQuantity("right_status", _NODE, "", "", "node in the right test", dtype=np.uint8, blank=1, codes=_STATUS),
 ]

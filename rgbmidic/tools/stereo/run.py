@@ -26,7 +26,7 @@ from rgbmidic.pipeline.plan import read_region
 from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.source import Series, open_frames
 from rgbmidic.results import Result, frame_times
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
@@ -191,6 +191,8 @@ def measure_stereo(
         for index in range(len(first)):
             yield shape.frame(nodal_values(first, index, carried.nodes), nodal_values(second, index))
 
+    with write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
     doubts = list[str]()
     times = frame_times(first)
     write_complete(

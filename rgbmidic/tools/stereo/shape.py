@@ -199,8 +199,8 @@ class Shape:
         if common > max(LIMITS.residual, LIMITS.factor * expected):
             yield (
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {expected:.3f} px: the "
-                f"cameras do not stand as {self.pair.name} states, and shape and displacement are off by as many px: "
-                "calibrate again (rgbmidic-calibrate stereo)"
+                f"cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: calibrate "
+                "again (rgbmidic-calibrate stereo)"
             )
         off = np.flatnonzero(changes > np.maximum(LIMITS.residual, LIMITS.factor * stated))
         if len(off):
