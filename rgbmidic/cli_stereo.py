@@ -94,7 +94,7 @@ def _print_summary(result: StereoResult) -> None:
 
     measured = np.isfinite(result["w"])
     stds = [float(np.nanmedian(result[f"{name}_std"][-1])) if measured[-1].any() else np.nan for name in "uvw"]
-    change = result["epipolar_change"][-1]
+    change, scale_std = result["epipolar_change"][-1], float(result.attributes["relative_length_std"])
     rows = {
         "frames": f"{len(result)}",
         "nodes": f"{measured.shape[1]}, {measured.mean():.1%} measured",
@@ -104,7 +104,7 @@ def _print_summary(result: StereoResult) -> None:
         "motion": "u, v, w of the last frame are known to " + ", ".join(f"{std:.2g}" for std in stds) + " mm (median)",
         "epipolar": f"residual {np.sqrt(np.mean(result['epipolar_common'] ** 2)):.3g} px rms common to all frames, "
         f"{np.sqrt(np.nanmean(change**2)) if measured[-1].any() else np.nan:.3g} px more in the last one",
-        "lengths": f"known to {result.attributes['relative_length_std']:.2g} of themselves by the calibration",
+        "lengths": f"known to {100 * scale_std:.2g} % by the calibration" if scale_std else "exact by the calibration",
         "result": str(result.path),
     }
     width = max(map(len, rows)) + 2

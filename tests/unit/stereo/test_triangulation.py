@@ -14,7 +14,7 @@ from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.tools.stereo import CameraPair, triangulate
 
 LENS = (FOCAL, 80.0, 61.0, -0.3, 4.0, 1e-3, -2e-3, 0)
-POINTS = np.random.default_rng(0).uniform(-10, 10, (50, 3)) + [0, 0, DISTANCE]
+POINTS = np.random.default_rng(0).uniform(-10, 10, (50, 3)) + np.array([0, 0, DISTANCE])
 
 
 def test_exact_points_come_back():
@@ -40,7 +40,7 @@ def test_errors_are_as_stated():
 def test_the_error_of_the_shape_cancels_in_the_displacement():
     """With the same weights; with others, an epipolar error of the reference would come through."""
     pair = pair_of(22.0, LENS)
-    (left, right), moved = pair.project(POINTS), pair.project(POINTS + [0.1, 0.2, 0.3])
+    (left, right), moved = pair.project(POINTS), pair.project(POINTS + np.array([0.1, 0.2, 0.3]))
     off = np.array([0.0, 0.4])  # px across the epipolar lines, in both states of the right camera
     spreads = [np.diag(values)[None].repeat(50, axis=0) for values in ([1.0, 1, 4, 4], [1.0, 16, 1, 1])]
     true = np.array([0.1, 0.2, 0.3])
