@@ -99,6 +99,10 @@ class ViewPair:
         seen = triangulate(pair, self.left.pixels, self.right.pixels, spread)
         return seen.points, seen.residual
 
+    def rms(self, pair: CameraPair) -> float:
+        """Epipolar residual of the points, px rms."""
+        return float(np.sqrt(np.mean(self.triangulated(pair, 1.0)[1] ** 2)))
+
     def relative_length(self, pair: CameraPair) -> float:
         """Distance of the two farthest points as triangulated, over that on the target."""
         target = self.left.points
@@ -349,7 +353,7 @@ class _Fit:
 def _linearised(
     pair: CameraPair, views: Sequence[ViewPair], poses: Sequence[Pose]
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Yield residuals (m, 4) of each view, and the slopes of the points by the cameras (m, 4, 22) and pose (m, 4, 6)."""
+    """Yield residuals (m, 4) of each view, and the slopes of its points by cameras (m, 4, 22) and pose (m, 4, 6)."""
     for view, (turn, shift) in zip(views, poses, strict=True):
         count = len(view.left.points)
         residual, by_cameras, by_pose = np.empty((count, 4)), np.zeros((count, 4, 22)), np.empty((count, 4, 6))

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from target_scene import DISTANCE, LENS, SHAPE, TARGET, imaged, pose
 
-from rgbmidic import CameraCalibration
+from rgbmidic import CameraCalibration, command
 from rgbmidic.errors import CalibrationError
-from rgbmidic.tools.stereo import CameraPair
+from rgbmidic.frames.data import ChannelFrame
+from rgbmidic.frames.images import write_tiff
+from rgbmidic.settings import FrameSettings
+from rgbmidic.tools.stereo import CameraPair, triangulate
+from rgbmidic_calibration import jobs
+from rgbmidic_calibration.captures import CaptureFiles
+from rgbmidic_calibration.cli import app
 from rgbmidic_calibration.stereo import ViewPair, estimate_stereo, verdicts
 from rgbmidic_calibration.target import View
 
@@ -57,7 +64,7 @@ def view_pairs(random, count=8, **noise):
 
 def test_pose_and_lengths_are_within_their_stated_uncertainty():
     random, off = np.random.default_rng(4), []
-    for _ in range(8):
+    for _ in range(5):
         pair = estimate_stereo(view_pairs(random)).pair
         std = np.sqrt(np.diag(pair.covariance))
         active = std > 0
@@ -71,8 +78,6 @@ def test_pose_and_lengths_are_within_their_stated_uncertainty():
         seen = TRUE.project(np.c_[random.uniform(-15, 15, (30, 2)), np.full(30, DISTANCE)])
 
         def log_length(other, seen=seen):
-            from rgbmidic.tools.stereo import triangulate
-
             points = triangulate(other, *seen, np.eye(4)[None].repeat(30, axis=0)).points
             return np.log(np.linalg.norm(points - points.mean(axis=0)))[None]
 
@@ -121,9 +126,95 @@ def test_views_of_different_times_are_refused():
 
 def test_too_few_views_and_points_are_refused():
     pairs = view_pairs(np.random.default_rng(9), 3)
-    with pytest.raises(CalibrationError, match="5 simultaneous views .* in 3; blurred"):
+    with pytest.raises(CalibrationError, match=r"5 simultaneous views .* in 3; blurred"):
         estimate_stereo(pairs, ["blurred"])
     view = pairs[0].left
     few = replace(view, points=view.points[:5], pixels=view.pixels[:5])
     with pytest.raises(CalibrationError, match="show 5 common points, 6 are needed"):
         ViewPair.of(few, view)
+
+
+@pytest.fixture
+def photographs(tmp_path, monkeypatch):
+    """Files of eight simultaneous photographs a camera, and of two more to check with; the target is found by name."""
+    random, found = np.random.default_rng(10), {}
+    frame = ChannelFrame(values=np.full((1, *SHAPE), 900, np.uint16), black_level=np.array(0.0), white_level=4095)
+    for number, pair in enumerate(view_pairs(random, 10)):
+        for side in ("left", "right"):
+            path = tmp_path / ("check" if number > 7 else "views") / f"{side}_{number}.tif"
+            path.parent.mkdir(exist_ok=True)
+            write_tiff(path, frame)
+            found[path.name] = getattr(pair, side)
+    monkeypatch.setattr(jobs, "find_view", lambda frame, target, name: replace(found[Path(name).name], name=name))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+FRAMES = ("--kind", "monochrome", "--black-level", "0", "--white-level", "4095", "--target", "chessboard:9x7:5mm")
+
+
+def options(folder, **changes):
+    sides = {f"--{side}": f"{folder}/{side}_*.tif" for side in ("left", "right")} | changes
+    return [item for pair in sides.items() for item in pair] + list(FRAMES)
+
+
+def test_the_command_calibrates_checks_and_shows(photographs, capsys):
+    assert command.execute(app, ["stereo", *options("views")]) == 0
+    pair = CameraPair.read("stereo.json")
+    assert pair.baseline == pytest.approx(TRUE.baseline, abs=0.1)
+    assert len(pair.details["provenance"]["inputs"]) == 16
+    assert "views held out: epipolar residual 0.0" in capsys.readouterr().out.replace("\n", " ")
+    assert command.execute(app, ["show", "stereo.json"]) == 0
+    assert command.execute(app, ["check", "stereo.json", *options("check")]) == 0
+    assert "PASSED" in capsys.readouterr().out
+    values = pair.parameters
+    values[[0, 8]] *= 1.002
+    pair.with_parameters(values).write("off.json")
+    assert command.execute(app, ["check", "off.json", *options("check")]) == 1
+    out = capsys.readouterr().out
+    assert "FAILED: 1 of 2" in out  # the length; the epipolar residual passes
+    span = np.linalg.norm(np.ptp(TARGET.points, axis=0))
+    assert command.execute(app, ["check", "stereo.json", *options("check"), "--distance", f"{1.002 * span}mm"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "--left has 8 photographs, --right 6"),
+        (["stereo", *options("views", **{"--right": "none/*.tif"})], "right: "),
+        (["stereo", *options("check")], "5 simultaneous views of the target at least"),
+        (["stereo", *options("views"), "--left-calibration", "a.json"], "belong together"),
+        (["stereo", *options("views"), "--out", "stereo.json"], "exists already"),
+        (["check", "stereo.json"], "--left, --right and --target"),
+        (["check", "stereo.json", *options("check"), "--distance", "1,2:3,4=5"], "one number in mm"),
+        (["check", "stereo.json", *options("check"), "--distance", "5"], "within a tenth"),
+        (["check", "views/left_0.tif", *options("check")], "for a file of two cameras"),
+    ],
+)
+def test_what_is_stated_wrongly_is_one_line(photographs, capsys, arguments, message):
+    TRUE.write("stereo.json")
+    if "--out" not in arguments and arguments[0] == "stereo":
+        arguments = [*arguments, "--out", "other.json"]
+    assert command.execute(app, arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_photographs_with_times_are_paired_by_them(photographs, monkeypatch):
+    stated = FrameSettings(path=("x",), kind="monochrome", black_level=0, white_level=4095)
+    files = [CaptureFiles.find(side, f"views/{side}_*.tif", stated) for side in ("left", "right")]
+    late = {"left": 0, "right": 2}
+
+    def time(series, index):
+        name = series.lights[0][index].path.name
+        return 1_000_000_000 * (index + late[name.split("_")[0]])
+
+    monkeypatch.setattr(type(files[0].series), "time_ns", time)
+    pairs, reasons = jobs.find_view_pairs((files[0], files[1]), TARGET)
+    assert [pair.right.name for pair in pairs] == [files[1].series.name(index) for index in range(6)]
+    assert [pair.left.name for pair in pairs] == [files[0].series.name(index) for index in range(2, 8)]
+    assert reasons == ()
+    late["right"] = 50
+    with pytest.raises(CalibrationError, match="the nearest are 43 s apart"):
+        jobs.find_view_pairs((files[0], files[1]), TARGET)
