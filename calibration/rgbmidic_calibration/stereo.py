@@ -174,7 +174,9 @@ def estimate_stereo(pairs: Sequence[ViewPair], rejected: Sequence[str] = ()) -> 
         "baseline_mm": fit.pair.baseline,
         "angle_deg": fit.pair.angle_deg,
     }
-    warnings = [text for estimate in estimates for text in estimate.camera.details["warnings"]] + list(rejected)
+    sides = zip(("left", "right"), estimates, strict=True)
+    warnings = [f"{side} camera: {text}" for side, one in sides for text in one.camera.details["warnings"]]
+    warnings += rejected
     if max(fit.rms) > CAMERA_LIMITS.max_residual:
         raise CalibrationError(
             f"the points are off by {max(fit.rms):.2f} px rms once both cameras are fitted together, at most "
