@@ -52,7 +52,8 @@ def written(folder: Path, scene: Scene, states: tuple[State, ...], seed: int) ->
             if side == "left"
             else (0, 0, width - 1, height - 1)
         )
-        text = f'[frames]\npath = "frames/*.dng"\n[calibration]\nfile = "calibration.json"\n[region]\nrectangle = {list(edges)}\n'
+        text = '[frames]\npath = "frames/*.dng"\n[calibration]\nfile = "calibration.json"\n[region]\n'
+        text += f"rectangle = {list(edges)}\n"
         (folder / side / "TEST.toml").write_text(text, encoding="utf-8")
     true_pair(scene, *views(scene)).write(folder / "stereo.json")
 
@@ -92,10 +93,9 @@ def rows_of(scene: Scene, states: dict[str, State], folder: Path, camera: Path) 
         strain = np.stack([result[c][number] for c in ("exx", "eyy", "exy")], axis=1)
         stated = np.stack([result[f"{c}_std"][number] for c in ("exx", "eyy", "exy")], axis=1)
         usable = inner & np.isfinite(strain).all(axis=1)
-        yield {"state": name} | figures(result, "uvw", motion, inner, number) | epipolar(result, "change", inner, number) | {
-            "strain [1e-4]": 1e4 * rms(strain[usable]),
-            "strain: error/stated": rms((strain / stated)[usable]),
-        }  # fmt: skip
+        row = figures(result, "uvw", motion, inner, number) | epipolar(result, "change", inner, number)
+        ratio = (strain / stated)[usable]
+        yield {"state": name} | row | {"strain [1e-4]": 1e4 * rms(strain[usable]), "strain: error/stated": rms(ratio)}
 
 
 def figures(result: StereoResult, names: str, true: np.ndarray, inner: np.ndarray, frame: int | None = None) -> Row:
@@ -131,9 +131,9 @@ COLUMNS = ("nodes [%]", "in plane [mm]", "out of plane [mm]", "in plane: error/s
 
 @table("stereo", page="how-to/stereo", cost=150, keys=3, seed=0, own_quick=True)
 def stereo(quick: bool) -> Iterator[Row]:
-    """Rms errors of two cameras 22° apart before a sphere that turns under three lamps (448 px, .055 mm per px, elements of
-    25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface strain over
-    77 px, of which there is none; with all three lamps, and with the red one alone in the same frames."""
+    """Rms errors of two cameras 22° apart before a sphere that turns under three lamps (448 px, .055 mm per px, elements
+    of 25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface strain
+    over 77 px, of which there is none; with all three lamps, and with the red one alone in the same frames."""
     logging.getLogger("rgbmidic").setLevel(logging.ERROR)
     for paint, gloss in {"shiny": 1.5, "mat": 0.0}.items():
         if quick and paint == "mat":
@@ -146,8 +146,7 @@ def stereo(quick: bool) -> Iterator[Row]:
             tests = {"three lamps": Path(folder)}
             if not quick and paint == "shiny":
                 tests["red of the same frames"] = of_one_lamp(Path(folder))
-            for lights, place in tests.items():
+            for lamps, place in tests.items():
                 for row in rows_of(scene, states, place, Path(folder) / "stereo.json"):
-                    yield {"paint": paint, "lamps": lights} | {"state": row["state"]} | {
-                        name: row.get(name, float("nan")) for name in COLUMNS
-                    }  # fmt: skip
+                    keys: Row = {"paint": paint, "lamps": lamps, "state": row["state"]}
+                    yield keys | {name: row.get(name, float("nan")) for name in COLUMNS}
