@@ -131,7 +131,7 @@ COLUMNS = ("nodes [%]", "in plane [mm]", "out of plane [mm]", "in plane: error/s
 
 @table("stereo", page="how-to/stereo", cost=150, keys=3, seed=0, own_quick=True)
 def stereo(quick: bool) -> Iterator[Row]:
-    """Rms errors of two cameras 22° apart before a sphere that turns under three lamps (448 px, .055 mm per px, elements
+    """Rms errors of two cameras 22° apart before a sphere turning under three lamps (448 px, .055 mm per px, elements
     of 25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface strain
     over 77 px, of which there is none; with all three lamps, and with the red one alone in the same frames."""
     logging.getLogger("rgbmidic").setLevel(logging.ERROR)

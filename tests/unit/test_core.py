@@ -8,7 +8,13 @@ import sys
 from pathlib import Path
 
 CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "results", "pipeline", "settings")
-TOOLS = ("typer", "rich", "bokeh", "matplotlib", *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view")))
+TOOLS = (
+    "typer",
+    "rich",
+    "bokeh",
+    "matplotlib",
+    *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view", "tools")),
+)
 
 
 SLOW = ("scipy.signal", "scipy.stats", "scipy.optimize", "numba")
