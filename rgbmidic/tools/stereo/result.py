@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from rgbmidic.tools.stereo.shape import Shape
 
-STEREO_FILE = "stereo.h5"
+STEREO_FILE = "stereo.vtkhdf"
 _SCHEMA, _VERSION = "rgbmidic-stereo-result", 1
 _NODE, _STATUS = ("node",), ("measured", "not seen", "decorrelated", "filled")
 _DOUBLE: dict[str, Any] = {"dtype": np.float64}

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.source import Series, open_frames
 from rgbmidic.results import Result, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
+from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
@@ -138,7 +139,7 @@ def measure_stereo(
     camera
         The cameras, or the file that ``rgbmidic-calibrate stereo`` wrote.
     out
-        Folder: ``left`` and ``right`` in it are ordinary results, ``stereo.h5`` is the result in three dimensions.
+        Folder: ``left`` and ``right`` in it are ordinary results, ``stereo.vtkhdf`` is the result in three dimensions.
     settings
         Axes, gauges, pairing.
     **run
@@ -165,7 +166,7 @@ def measure_stereo(
     if images[0].names != images[1].names:
         names = " and ".join(f"{', '.join(of.names)} ({test.name})" for of, test in zip(images, tests, strict=True))
         raise InputError(f"both cameras must see the same lights in the same order; theirs are {names}")
-    first = tests[0].result or measure(tests[0].settings, out / "left", **run)
+    first = tests[0].result or measure(tests[0].settings, out / "left", **_begun(out / "left", run))
     carried = carry_mesh(
         images,
         Tri3Mesh(nodes=first.nodes, elements=first.elements),
@@ -207,12 +208,17 @@ def measure_stereo(
     return StereoResult.open(file)
 
 
-def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: Any) -> Result:
+def _begun(out: Path, run: RunOptions) -> RunOptions:
+    """Return the options of a run into a folder: one that has not begun is not resumed."""
+    return {**run, "resume": run.get("resume", False) and is_result(out)}
+
+
+def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: RunOptions) -> Result:
     """Measure the right test on the carried mesh; a result that was measured on it is taken as it is."""
     if test.result is not None and np.array_equal(test.result.nodes, mesh.nodes):
         return test.result
     mesh_settings = MeshSettings(element_size=mesh.size, error=test.settings.mesh.error)
-    return measure(replace(test.settings, mesh=mesh_settings), out, mesh=mesh, region=region, **run)
+    return measure(replace(test.settings, mesh=mesh_settings), out, mesh=mesh, region=region, **_begun(out, run))
 
 
 def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:

@@ -35,10 +35,14 @@ class StereoLimits:
         Challenge 1.0, sample 3), which moves the shape by as many px.
     factor
         The same over the stated uncertainty.
+    outlier
+        Deviation of a node's residual from the median, over the scatter of all or the stated one, from which its match
+        is in doubt: six standard deviations are no chance.
     """
 
     residual: float = 0.06
     factor: float = 3.0
+    outlier: float = 6.0
 
 
 LIMITS = StereoLimits()
@@ -201,6 +205,13 @@ class Shape:
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {expected:.3f} px: the "
                 f"cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: calibrate "
                 "again (rgbmidic-calibrate stereo)"
+            )
+        deviation = np.abs(shape.residual - np.median(shape.residual))
+        scatter = np.maximum(1.4826 * np.median(deviation), shape.residual_std)
+        if wrong := int((deviation > np.maximum(LIMITS.outlier * scatter, LIMITS.residual)).sum()):
+            yield (
+                f"at {wrong} of {len(deviation)} nodes the references are in doubt: their epipolar residual is off by "
+                f"up to {deviation.max():.3f} px from that of the others (epipolar_common); their shape is, too"
             )
         off = np.flatnonzero(changes > np.maximum(LIMITS.residual, LIMITS.factor * stated))
         if len(off):

@@ -13,7 +13,15 @@ from stereo_scene import DISTANCE, MOTIONS, SHAPE, Motion, image, pair_of, write
 from rgbmidic import Region, Result, Tri3Mesh
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.tools.stereo import QUANTITIES, StereoResult, StereoSettings, carry_mesh, measure_stereo
+from rgbmidic.tools.stereo import (
+    QUANTITIES,
+    CarriedMesh,
+    Shape,
+    StereoResult,
+    StereoSettings,
+    carry_mesh,
+    measure_stereo,
+)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +112,7 @@ def test_the_file_is_read_by_others(measured, tmp_path):
 def test_a_left_result_is_taken_and_an_interrupted_one_gone_on_with(measured, pair, tmp_path):
     folder, result = measured
     shutil.copytree(folder / "result", tmp_path / "result")
-    (tmp_path / "result/stereo.h5").unlink()
+    (tmp_path / "result/stereo.vtkhdf").unlink()
     (tmp_path / "result/right/solution/000002.npz").unlink()
     tests = folder / "left/TEST.toml", folder / "right/TEST.toml"
     settings = StereoSettings(axes="camera")
@@ -145,7 +153,7 @@ def test_tests_that_contradict_each_other_are_refused(measured, pair, tmp_path, 
     (tmp_path / "right/TEST.toml").write_text(text.replace(before, after))
     with pytest.raises(InputError, match=message):
         measure_stereo(folder / "result/left", tmp_path / "right/TEST.toml", pair, tmp_path / "result")
-    assert not (tmp_path / "result/stereo.h5").exists()
+    assert not (tmp_path / "result/stereo.vtkhdf").exists()
 
 
 def test_frame_rates_and_times_that_differ_are_refused(measured, pair, tmp_path, monkeypatch):
@@ -204,3 +212,28 @@ def test_other_lights_are_refused(pair):
     first, second = images_of(np.ones(SHAPE)), images_of(np.ones(SHAPE), names=("green",))
     with pytest.raises(InputError, match="theirs are lamp and green"):
         carry_mesh((first[0], second[0]), mesh)
+
+
+def test_a_run_that_stopped_before_the_right_camera_goes_on(measured, pair, tmp_path):
+    folder, result = measured
+    (tmp_path / "result").mkdir()
+    shutil.copytree(folder / "result/left", tmp_path / "result/left")
+    tests = folder / "left/TEST.toml", folder / "right/TEST.toml"
+    again = measure_stereo(*tests, pair, tmp_path / "result", StereoSettings(axes="camera"), resume=True, workers=1)
+    assert np.array_equal(again["w"], result["w"], equal_nan=True)
+
+
+def test_a_node_that_is_matched_wrongly_is_reported(measured, pair):
+    _, result = measured
+    pixels = [np.stack([result[f"x_{side}"], result[f"y_{side}"]], axis=1) for side in ("left", "right")]
+    pixels[1][20, 1] += 0.7
+    meshes = [Tri3Mesh(nodes=nodes, elements=result.elements) for nodes in pixels]
+    carried = CarriedMesh(
+        nodes=result["left_node"],
+        left=meshes[0],
+        right=meshes[1],
+        region=meshes[1].region(SHAPE),
+        right_std=np.full((len(pixels[0]), 2), 0.01),
+    )
+    doubts = list(Shape.of(pair, carried).doubts(np.zeros(3), np.ones(3)))
+    assert any(text.startswith(f"at 1 of {len(pixels[0])} nodes") for text in doubts)
