@@ -184,9 +184,9 @@ def estimate_stereo(pairs: Sequence[ViewPair], rejected: Sequence[str] = ()) -> 
         )
     held_out = list(pairs[LIMITS.held_out - 1 :: LIMITS.held_out])
     if held_out and len(pairs) - len(held_out) >= LIMITS.min_fitted:
-        chosen = [number for number in range(len(pairs)) if (number + 1) % LIMITS.held_out]
-        part = _Fit.solved(fit.pair, [pairs[n] for n in chosen], [fit.poses[n] for n in chosen], estimates)
-        details["held_out"] = {"views": [pair.name for pair in held_out], **verdicts(part.pair, held_out)}
+        fitted = [number for number in range(len(pairs)) if (number + 1) % LIMITS.held_out]
+        subset_fit = _Fit.solved(fit.pair, [pairs[n] for n in fitted], [fit.poses[n] for n in fitted], estimates)
+        details["held_out"] = {"views": [pair.name for pair in held_out], **verdicts(subset_fit.pair, held_out)}
     else:
         warnings.append(
             f"{len(pairs)} views are too few to hold some out: the epipolar residual and a distance on other views are "
@@ -278,11 +278,11 @@ def _agreeing(
             f"{pairs[int(angles.argmax())].name} show the cameras {angles.max():.1f} degrees off where the other views "
             "have them: were they taken at one time, and do the lists of files pair the right ones? Leave them out"
         )
-    chosen = [min(options, key=lambda entry: angle(best, entry[1])) for options in candidates]
+    selected = [min(options, key=lambda entry: angle(best, entry[1])) for options in candidates]
     lenses = [replace(camera, covariance=np.zeros((16, 16)), details={}) for camera in cameras]
-    translation = np.median([pose[1] for _, pose in chosen], axis=0)
+    translation = np.median([pose[1] for _, pose in selected], axis=0)
     pair = CameraPair(left=lenses[0], right=lenses[1], rotation=best[0], translation=translation)
-    return [option for option, _ in chosen], pair, poses
+    return [option for option, _ in selected], pair, poses
 
 
 def _angle_from_target(pair: CameraPair, poses: Sequence[Pose]) -> float:
@@ -317,11 +317,11 @@ class _Fit:
             normal, right_side, total, blocks = np.zeros((len(active), len(active))), np.zeros(len(active)), 0.0, []
             for residual, by_cameras, by_pose in _linearised(pair, views, poses):
                 r = (residual / noise).ravel()
-                cameras, own = (
+                cameras, target_slopes = (
                     (slopes / noise[:, None]).reshape(len(r), -1) for slopes in (by_cameras[..., active], by_pose)
                 )
-                projection = np.linalg.pinv(own)
-                across = cameras - own @ (projection @ cameras)
+                projection = np.linalg.pinv(target_slopes)
+                across = cameras - target_slopes @ (projection @ cameras)
                 normal += across.T @ across
                 right_side += across.T @ r
                 total += float(r @ r)

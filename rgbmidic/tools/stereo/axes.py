@@ -71,9 +71,9 @@ class Axes:
             return cls._from(origin, np.array([1.0, 0.0, 0.0]), normal, "of the plane that fits the surface best")
         needed = "axes through points need three points (x, y) in px of the left reference"
         pixels = as_numbers(choice, needed, (3, 2), error=InputError)
-        places = MeshPoints.of(mesh, pixels)
-        places.check("a point of the axes")
-        first, second, third = np.stack([places.read(values) for values in points.T], axis=1)
+        mesh_points = MeshPoints.of(mesh, pixels)
+        mesh_points.check("a point of the axes")
+        first, second, third = np.stack([mesh_points.read(values) for values in points.T], axis=1)
         normal = np.cross(second - first, third - first)
         if not np.linalg.norm(normal) > 1e-3 * np.linalg.norm(second - first) * np.linalg.norm(third - first):
             raise InputError(f"{needed} that do not lie on a line; given are {pixels.tolist()}")

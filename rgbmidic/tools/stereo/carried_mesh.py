@@ -142,28 +142,28 @@ def carry_mesh(
     if right_region is not None:
         column, row = np.clip(np.round(positions), 0, last_pixel).astype(int).T
         inside &= right_region.mask[row, column]
-    kept = _connected(mesh, positions, inside)
-    if not kept.any():
+    is_carried = _connected(mesh, positions, inside)
+    if not is_carried.any():
         raise InputError("no element of the left mesh lies in the right camera's region with all its nodes")
-    submesh = mesh.submesh(kept)
-    right = Tri3Mesh(nodes=positions[kept], elements=submesh.elements)
+    submesh = mesh.submesh(is_carried)
+    right = Tri3Mesh(nodes=positions[is_carried], elements=submesh.elements)
     warnings = []
     if record.status == Status.NOT_CONVERGED:
         warnings.append(f"the match of the references did not converge everywhere and is taken: {record.reason}")
-    if missing := int((~kept).sum()):
+    if missing := int((~is_carried).sum()):
         warnings.append(
-            f"{missing} of {len(kept)} nodes of the left mesh are not carried to the right camera "
+            f"{missing} of {len(is_carried)} nodes of the left mesh are not carried to the right camera "
             f"({int((~matched).sum())} without a match, the others outside its frame or region or beside such nodes): "
             "they have no data in three dimensions"
         )
     for text in warnings:
         logger.warning("%s", text)
     return CarriedMesh(
-        nodes=np.flatnonzero(kept).astype(np.int64),
+        nodes=np.flatnonzero(is_carried).astype(np.int64),
         left=submesh,
         right=right,
         region=right.region(right_shape),
-        right_std=std[kept],
+        right_std=std[is_carried],
         warnings=tuple(warnings),
     )
 
@@ -230,10 +230,10 @@ def _on_epipolar_lines(pair: CameraPair, nodes: FloatArray) -> Iterator[FloatArr
     from there, nearer and farther, by steps that move the nodes in the right frame by as much as the search looks.
     """
     turn, shift = pair.poses[1]
-    axis, place = turn[2], -turn.T @ shift  # the right camera's axis and place in the left one's axes
+    axis, right_centre = turn[2], -turn.T @ shift  # the right camera's axis and centre in the left one's axes
     # on the left axis, the point nearest to the right one: (0, 0, depth)
     across = np.eye(3) - np.outer(axis, axis)
-    depth = float(across[2] @ place / across[2, 2]) if across[2, 2] > 1e-6 else 10 * pair.baseline
+    depth = float(across[2] @ right_centre / across[2, 2]) if across[2, 2] > 1e-6 else 10 * pair.baseline
     depth = depth if depth > 0 else 10 * pair.baseline
     normal = (np.array([0.0, 0.0, 1.0]) + axis) / np.linalg.norm(np.array([0.0, 0.0, 1.0]) + axis)
     rays = np.c_[image_plane(pair.left, nodes)[0], np.ones(len(nodes))]

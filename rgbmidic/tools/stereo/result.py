@@ -279,22 +279,22 @@ def write_stereo(
     """
     import h5py
 
-    count, carried, text = len(names), shape.carried, h5py.string_dtype()
-    changes, stated = np.full((2, count), np.nan)
+    count, meshes, text = len(names), shape.carried_mesh, h5py.string_dtype()
+    changes, expected = np.full((2, count), np.nan)
     with h5py.File(file, "w") as out:
         out.attrs.update({"schema": _SCHEMA, "schema_version": _VERSION, **attributes})
         out["time"] = np.arange(count, dtype=np.float64) if times is None else times
         out["time"].attrs["units"] = "1" if times is None else "s"
-        out["node"] = np.arange(len(carried.nodes), dtype=np.int32)
-        out["element"] = np.arange(len(carried.left.elements), dtype=np.int32)
+        out["node"] = np.arange(len(meshes.nodes), dtype=np.int32)
+        out["element"] = np.arange(len(meshes.left.elements), dtype=np.int32)
         for name in ("time", "node", "element"):
             out[name].make_scale(name)
         out.create_dataset("name", data=np.array(list(names), dtype=text))
-        out["elements"] = carried.left.elements
+        out["elements"] = meshes.left.elements
         for name, array in _shared_values(shape).items():
             _add(out, QUANTITIES[name], data=array.astype(QUANTITIES[name].dtype))
         for entry in _OF_FRAMES:
-            size = (count, len(carried.nodes), *(axis for axis in entry.axes if isinstance(axis, int)))
+            size = (count, len(meshes.nodes), *(axis for axis in entry.axes if isinstance(axis, int)))
             _add(out, entry, shape=size, dtype=entry.dtype)
         _declare_grid(out, shape.points, out["time"][...])
         for index, values in enumerate(frames):
@@ -303,21 +303,21 @@ def write_stereo(
             measured = np.isfinite(values["epipolar_change"])
             if measured.any():
                 changes[index] = np.sqrt(np.mean(values["epipolar_change"][measured] ** 2))
-                stated[index] = np.sqrt(np.mean(values["epipolar_change_std"][measured] ** 2))
-            rows = slice(index * len(carried.nodes), (index + 1) * len(carried.nodes))
+                expected[index] = np.sqrt(np.mean(values["epipolar_change_std"][measured] ** 2))
+            rows = slice(index * len(meshes.nodes), (index + 1) * len(meshes.nodes))
             out["VTKHDF/PointData/displacement"][rows] = np.stack([values[name] for name in "uvw"], axis=1)
-        doubts = [*carried.warnings, *shape.doubts(changes, stated)]
+        doubts = [*meshes.warnings, *shape.doubts(changes, expected)]
         out.attrs["warnings"] = json.dumps(doubts)
     return doubts
 
 
 def _shared_values(shape: Shape) -> dict[str, AnyArray]:
     """Return the quantities that all frames share."""
-    carried, seen = shape.carried, shape.triangulation
+    meshes, triangulated = shape.carried_mesh, shape.triangulation
     std = np.sqrt(np.maximum(np.diagonal(shape.covariance, axis1=1, axis2=2), 0))
-    values: dict[str, AnyArray] = {"left_node": carried.nodes, "shape_covariance": shape.covariance}
-    values |= {"epipolar_common": seen.residual, "epipolar_common_std": seen.residual_std}
-    for side, mesh in (("left", carried.left), ("right", carried.right)):
+    values: dict[str, AnyArray] = {"left_node": meshes.nodes, "shape_covariance": shape.covariance}
+    values |= {"epipolar_common": triangulated.residual, "epipolar_common_std": triangulated.residual_std}
+    for side, mesh in (("left", meshes.left), ("right", meshes.right)):
         values |= {f"x_{side}": mesh.nodes[:, 0], f"y_{side}": mesh.nodes[:, 1]}
     for column_index, name in enumerate("xyz"):
         values |= {name: shape.points[:, column_index], f"{name}_std": std[:, column_index]}

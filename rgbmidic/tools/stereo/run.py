@@ -115,9 +115,9 @@ class _Test:
     def reference(self) -> IlluminationImages:
         """Return the mean images of the lights over the reference frames, each where the lens put it."""
         separation = Separation(calibration=self.calibration, demosaic=self.settings.illumination.demosaic)
-        whole = Window.of_frame(self.series.shape)
-        states = (self.series.read(index, whole) for index in self.settings.frames.reference)
-        return reference_images(separation, states, whole)[0]
+        full_frame = Window.of_frame(self.series.shape)
+        states = (self.series.read(index, full_frame) for index in self.settings.frames.reference)
+        return reference_images(separation, states, full_frame)[0]
 
 
 def measure_stereo(
@@ -166,16 +166,16 @@ def measure_stereo(
     if images[0].names != images[1].names:
         names = " and ".join(f"{', '.join(of.names)} ({test.name})" for of, test in zip(images, tests, strict=True))
         raise InputError(f"both cameras must see the same lights in the same order; theirs are {names}")
-    first = tests[0].result or measure(tests[0].settings, out / "left", **_begun(out / "left", run))
-    carried = carry_mesh(
+    first = tests[0].result or measure(tests[0].settings, out / "left", **_resumable(out / "left", run))
+    mesh_pair = carry_mesh(
         images,
         Tri3Mesh(nodes=first.nodes, elements=first.elements),
         pair=pair,
         right_region=read_region(tests[1].settings.region, tests[1].series.shape),
         solver=tests[0].settings.solver,
     )
-    shape = Shape.of(pair, carried, axes=settings.axes, gauge=settings.gauge, measure=settings.measure)
-    second = _measure_right(tests[1], carried.right, carried.region, out / "right", run)
+    shape = Shape.of(pair, mesh_pair, axes=settings.axes, gauge=settings.gauge, measure=settings.measure)
+    second = _measure_right(tests[1], mesh_pair.right, mesh_pair.region, out / "right", run)
     attributes = {
         "axes": shape.axes.description,
         "axes_origin_mm": shape.axes.origin,
@@ -190,7 +190,7 @@ def measure_stereo(
 
     def frames() -> Iterator[dict[str, AnyArray]]:
         for index in range(len(first)):
-            yield shape.frame(nodal_values(first, index, carried.nodes), nodal_values(second, index))
+            yield shape.frame(nodal_values(first, index, mesh_pair.nodes), nodal_values(second, index))
 
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -203,12 +203,12 @@ def measure_stereo(
         ),
     )
     for text in doubts:
-        if text not in carried.warnings:  # reported when it was found
+        if text not in mesh_pair.warnings:  # reported when it was found
             logger.warning("%s", text)
     return StereoResult.open(file)
 
 
-def _begun(out: Path, run: RunOptions) -> RunOptions:
+def _resumable(out: Path, run: RunOptions) -> RunOptions:
     """Return the options of a run into a folder: one that has not begun is not resumed."""
     return {**run, "resume": run.get("resume", False) and is_result(out)}
 
@@ -218,7 +218,7 @@ def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: 
     if test.result is not None and np.array_equal(test.result.nodes, mesh.nodes):
         return test.result
     mesh_settings = MeshSettings(element_size=mesh.size, error=test.settings.mesh.error)
-    return measure(replace(test.settings, mesh=mesh_settings), out, mesh=mesh, region=region, **_begun(out, run))
+    return measure(replace(test.settings, mesh=mesh_settings), out, mesh=mesh, region=region, **_resumable(out, run))
 
 
 def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:

@@ -54,7 +54,7 @@ class Shape:
 
     Attributes
     ----------
-    pair, carried
+    pair, carried_mesh
         Cameras, and the mesh in both frames.
     triangulation
         Of the reference states, left camera's axes.
@@ -70,7 +70,7 @@ class Shape:
     """
 
     pair: CameraPair
-    carried: CarriedMesh
+    carried_mesh: CarriedMesh
     triangulation: Triangulation
     axes: Axes
     points: FloatArray
@@ -82,7 +82,7 @@ class Shape:
     def of(
         cls,
         pair: CameraPair,
-        carried: CarriedMesh,
+        carried_mesh: CarriedMesh,
         *,
         axes: AxesChoice = "plane",
         gauge: float | None = None,
@@ -92,7 +92,7 @@ class Shape:
 
         Parameters
         ----------
-        pair, carried
+        pair, carried_mesh
             Cameras, and the mesh in both frames.
         axes
             As of `Axes.of`.
@@ -110,31 +110,31 @@ class Shape:
         InputError
             A node lies where a lens has no inverse or behind a camera, or axes and gauge are not possible.
         """
-        exact = np.full_like(carried.right_std, _EXACT)
-        spread = _diagonal(exact, np.maximum(carried.right_std, _EXACT))
-        pixels = carried.left.nodes, carried.right.nodes
+        exact = np.full_like(carried_mesh.right_std, _EXACT)
+        spread = _diagonal(exact, np.maximum(carried_mesh.right_std, _EXACT))
+        pixels = carried_mesh.left.nodes, carried_mesh.right.nodes
         shape = triangulate(pair, *pixels, spread)
         if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
-        chosen = Axes.of(axes, carried.left, shape.points)
-        points = chosen.points(shape.points)
-        some = slice(None, None, len(points) // _CORRELATED + 1)
+        axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
+        points = axes_in_space.points(shape.points)
+        sampled = slice(None, None, len(points) // _CORRELATED + 1)
 
-        def uncertain(other: CameraPair) -> FloatArray:
-            seen = triangulate(other, pixels[0][some], pixels[1][some], spread[some])
-            extent = np.linalg.norm(seen.points - seen.points.mean(axis=0), axis=1)
-            return np.asarray(np.r_[np.log(np.sqrt(np.mean(extent**2))), seen.residual])
+        def uncertain(perturbed: CameraPair) -> FloatArray:
+            triangulated = triangulate(perturbed, pixels[0][sampled], pixels[1][sampled], spread[sampled])
+            extent = np.linalg.norm(triangulated.points - triangulated.points.mean(axis=0), axis=1)
+            return np.asarray(np.r_[np.log(np.sqrt(np.mean(extent**2))), triangulated.residual])
 
         errors = pair.sensitivity(uncertain)
         scale_std, residual_std = np.linalg.norm(errors[0]), np.sqrt((errors[1:] ** 2).sum(axis=1).mean())
         return cls(
             pair=pair,
-            carried=carried,
+            carried_mesh=carried_mesh,
             triangulation=shape,
-            axes=chosen,
+            axes=axes_in_space,
             points=points,
-            covariance=chosen.covariance(shape.covariance),
-            gauges=SurfaceGauges.around_nodes(carried.left, points, gauge, measure),
+            covariance=axes_in_space.covariance(shape.covariance),
+            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
             calibration_std=np.array([scale_std, residual_std]),
         )
 
@@ -151,15 +151,15 @@ class Shape:
         dict
             Quantities of `rgbmidic.tools.stereo.result.QUANTITIES` that a frame has, by name.
         """
-        moved, stds = (
+        displacements, stds = (
             [np.stack([side[f"u{end}"], side[f"v{end}"]], axis=1, dtype=np.float64) for side in (left, right)]
             for end in ("", "_std")
         )
         spread = _diagonal(*stds)
         floored = np.where(np.isfinite(spread), spread, 1.0) + _EXACT**2 * np.eye(4)
         weights = np.asarray(np.linalg.inv(floored), dtype=np.float64)
-        nodes = self.carried.left.nodes, self.carried.right.nodes
-        deformed = triangulate(self.pair, nodes[0] + moved[0], nodes[1] + moved[1], spread, weights)
+        nodes = self.carried_mesh.left.nodes, self.carried_mesh.right.nodes
+        deformed = triangulate(self.pair, nodes[0] + displacements[0], nodes[1] + displacements[1], spread, weights)
         # with the same weights: the error of the shape is in both, and cancels in their difference
         reference = triangulate(self.pair, *nodes, spread, weights)
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
@@ -185,12 +185,12 @@ class Shape:
                 values |= {name: array[:, column], f"{name}_std": error[:, column]}
         return values
 
-    def doubts(self, changes: FloatArray, stated: FloatArray) -> Iterator[str]:
+    def doubts(self, changes: FloatArray, expected: FloatArray) -> Iterator[str]:
         """Yield warnings about the epipolar residual.
 
         Parameters
         ----------
-        changes, stated : ndarray, shape (T,)
+        changes, expected : ndarray, shape (T,)
             rms over the nodes of its change since the reference in each frame, and of what is stated of it, px.
 
         Yields
@@ -199,11 +199,11 @@ class Shape:
         """
         shape = self.triangulation
         common = float(np.sqrt(np.mean(shape.residual**2)))
-        expected = float(np.sqrt(np.mean(shape.residual_std**2) + self.calibration_std[1] ** 2))
-        if common > max(LIMITS.residual, LIMITS.factor * expected):
+        common_std = float(np.sqrt(np.mean(shape.residual_std**2) + self.calibration_std[1] ** 2))
+        if common > max(LIMITS.residual, LIMITS.factor * common_std):
             yield (
-                f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {expected:.3f} px: the "
-                f"cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: calibrate "
+                f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {common_std:.3f} px: "
+                f"the cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: calibrate "
                 "again (rgbmidic-calibrate stereo)"
             )
         deviation = np.abs(shape.residual - np.median(shape.residual))
@@ -213,13 +213,13 @@ class Shape:
                 f"at {wrong} of {len(deviation)} nodes the references are in doubt: their epipolar residual is off by "
                 f"up to {deviation.max():.3f} px from that of the others (epipolar_common); their shape is, too"
             )
-        off = np.flatnonzero(changes > np.maximum(LIMITS.residual, LIMITS.factor * stated))
+        off = np.flatnonzero(changes > np.maximum(LIMITS.residual, LIMITS.factor * expected))
         if len(off):
             worst = off[np.argmax(changes[off])]
             yield (
                 f"the epipolar residual changes in {len(off)} frames, by {changes[worst]:.3f} px rms in frame {worst} "
-                f"where {stated[worst]:.3f} px are stated: a camera moved or the frames of both cameras were not taken "
-                "at one time"
+                f"where {expected[worst]:.3f} px are stated: a camera moved or the frames of both cameras were not "
+                "taken at one time"
             )
 
 

@@ -104,8 +104,8 @@ class SurfaceGauges:
         deformed = tangents + slopes
         to_axes = np.linalg.inv(_tangent_axes(tangents).transpose(0, 2, 1) @ tangents)
         gradient = deformed @ to_axes
-        left, _, right = np.linalg.svd(gradient, full_matrices=False)
-        turn = (left @ right).transpose(0, 2, 1)  # Q^T
+        left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
+        turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
         spread_in_plane = np.einsum(
             "gai,gdb,gidje,gcj,gef->gabcf", turn, to_axes, of_slopes, turn, to_axes, optimize=True
         )
