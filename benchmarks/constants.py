@@ -1,9 +1,9 @@
 """How much the chosen constants of the solve matter: each is halved and doubled.
 
-Seven scenes with exact speckle and noise of 3 grey levels. Three have a motion with strain and rotation, and
+Six scenes with exact speckle and noise of 3 grey levels. Three have a motion with strain and rotation, and
 reflections of up to 60 grey levels in the deformed state: three lights with a reflection in each, the same with a
 part left out and rigid motions, and one light whose reflection decorrelates nodes. One light sees the others: a part
-shows another texture, two bodies move apart, a shadow takes nearly all contrast, with both ways to correct it.
+shows another texture, two bodies move apart, a shadow takes nearly all contrast.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def scenes(method: Method) -> dict[str, Solution]:
 
 @table("constants", page="explanation/uncertainty", cost=20, keys=2, seed=3, within=NOTHING)
 def constants(quick: bool) -> Iterator[Row]:
-    """Constants of the solve halved and doubled (ten- or a hundredfold where only the order counts), in seven scenes:
+    """Constants of the solve halved and doubled (ten- or a hundredfold where only the order counts), in six scenes:
     root mean square change of the displacement over its stated uncertainty, change of the median stated uncertainty,
     and of the fraction of nodes measured; the larger of the two, in the scene where it is largest.
     """

@@ -159,7 +159,7 @@ class Demo:
         self.raw = read_frame(files[-1])
         self.before, self.after = (separate(read_frame(file), calibration).values for file in (files[0], files[-1]))
         self.result = Result.open(folder / "result")
-        options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size, "normalise": 10.0}
+        options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size}
         self.alone = correlate(self.before[0], self.after[0], **options)
         with np.load(folder / "test" / "truth.npz") as archive:
             self.truth = archive["displacement"][-1]
@@ -176,14 +176,15 @@ def droplets() -> tuple[Any, Any, list[Any]]:
     """The bench with raised droplets turned by 8 degrees: green's image, truth, solutions by green alone and by all."""
     sys.path.append(str(ROOT / "examples" / "paper"))
     from bench import Bench
-    from rgbmidic import correlate
+    from rgbmidic import correlate, measure_sequence
 
     bench = Bench.build("bayer", 640)
     clean = [bench.render(angle) for angle in (0.0, 8.0)]
     gain = bench.exposure_gain(max(bench.brightest(images) for images in clean))
-    f, g = (bench.photograph(images * gain, shot, "auto").values for shot, images in enumerate(clean))
-    solutions = [correlate(f[lights], g[lights], region=bench.region, normalise=10.0) for lights in ([1], slice(None))]
-    return g[1], bench.truth(8.0), solutions
+    first, second = (bench.photograph(images * gain, shot, "auto") for shot, images in enumerate(clean))
+    alone = correlate(first.values[1], second.values[1], region=bench.region)
+    (together,) = measure_sequence([second], reference=first, region=bench.region)  # with the lights' registration
+    return second.values[1], bench.truth(8.0), [alone, together]
 
 
 def reflection(theme: str, demo: Demo) -> None:
@@ -229,7 +230,7 @@ def match(theme: str, demo: Demo) -> None:
     ink, faint, _ = THEMES[theme]
     rows, columns = np.mgrid[:448, :448].astype(float)
     places = rows + demo.truth[1], columns + demo.truth[0]
-    # divided by their local mean, as the solve does (sigma 10 px)
+    # divided by their local mean (sigma 10 px), which takes out shading
     before, after = (images / gaussian_filter(images, (0, 10, 10)) for images in (demo.before, demo.after))
     warped = np.stack([map_coordinates(image, places, order=3, mode="nearest") for image in after])
     # where red errs most against blue, over the stretch that is drawn

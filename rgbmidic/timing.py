@@ -14,7 +14,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 STAGES = ("reading", "separation", "preparation", "search", "weights", "equations", "iteration", "conclusion", "rest")
-"""Of a frame: its file; one image per light; normalised and interpolable images; an initial guess; comparison with the
+"""Of a frame: its file; one image per light; filtered and interpolable images; an initial guess; comparison with the
 reference and the weights from it; Hessian and factors; Gauss-Newton; the field and its uncertainty; all other work."""
 
 

@@ -47,7 +47,7 @@ class Method:
     weighted: bool = False  # whether reflections are excluded by binary weights
     brightness: Literal["none", "local"] = "none"  # grey-level correction of the solver
     ours: bool = False  # rgbmidic's solver; else linear elements and own gradients, as in the paper
-    default: bool = False  # rgbmidic's own settings: local normalisation, prefilter, weights by statistics
+    default: bool = False  # rgbmidic's own settings: grey-level correction, prefilter, weights by statistics
     demosaic: str = "malvar"  # of a Bayer mosaic; Malvar's for the paper's methods, whose figures are about the solve
 
 

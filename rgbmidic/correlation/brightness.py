@@ -33,6 +33,9 @@ def _block_side(sigma: float) -> int:
 class GainFit:
     """Gain of one field over another, by local linear regression in a Gaussian window (Fan and Gijbels 1996).
 
+    Around a block the gain is linear, and such that the field and the gain times the other one have the same weighted
+    sum and first moments in the window; a ridge holds its slope back where the pixels do not determine it.
+
     Attributes
     ----------
     pixels

@@ -1,6 +1,7 @@
 """The constants of the solve, each with its source: chosen, measured or derived.
 
-What half and twice a chosen one changes is in ``docs/tables/constants.csv`` (benchmarks/constants.py).
+What half and twice a chosen one changes in the scene that changes most is in ``docs/tables/constants.csv``
+(benchmarks/constants.py); changes below are of those scenes, one by one.
 """
 
 from __future__ import annotations
@@ -19,21 +20,24 @@ class SolverConstants:
         is needed, but from another initial guess the result differs by up to 2.3e-4 px (measured).
     min_initial_zncc
         Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
-        nearer. Chosen; half or twice of it matters beside a hole and in a deep shadow.
+        nearer. Chosen; half or twice of it matters where images do not match alone: beside a hole, between two bodies
+        and in a deep shadow, by .07 to .15 of the stated uncertainty.
     max_reactivation_passes
-        Passes after which elements may take part again. Chosen: at a fragment's edge some come and go with every pass,
-        which costs iterations; after a single pass what a crack or another body pulls at first is left out for good.
+        Passes after each of which elements may take part again. Chosen: at a fragment's edge some come and go with
+        every pass, which costs iterations; after a single pass what a crack or another body pulls at first is left out
+        for good.
     divergence_step
         Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the
         elements around a node are left out after `max_reactivation_passes` passes: its own pixels match nothing.
         Chosen: ten times what ends the first pass.
     reweight_motion
-        Motion (px) of more than `max_oscillating_fraction` of the nodes from where weights and grey levels were learnt,
-        after which those of several lights are learnt once more: what all lights alike show of the motion hides which
-        of them is the precise one. Chosen: a hundredth of a speckle, which a residual still shows.
+        Motion (px) of more than `max_oscillating_fraction` of the nodes from where the weights of several lights were
+        learnt, after which these are learnt once more: what all lights alike show of the motion hides which of them is
+        the precise one. Chosen: a hundredth of a speckle, which a residual still shows.
     max_oscillating_fraction
         Fraction of the nodes that may be left out at the end because they still move: a few at the rim of a fragment,
-        half of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen.
+        half of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen; half or
+        twice of it matters in a deep shadow and with rigid motions of the lights, by .15 of the stated uncertainty.
     weight_tolerance
         Fraction of the weight that may still change for the passes to end. Chosen; a hundredth or a hundred times of it
         matter in a deep shadow only.
@@ -47,8 +51,7 @@ class SolverConstants:
         Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests).
     patience
         Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or
-        faster with the weights of the next pass. Chosen; 1 to 3 give the same, with 5 a fragment that has turned takes
-        one more.
+        faster with the weights of the next pass. Chosen; 2 or 6 matter in a deep shadow only.
     max_overshoot
         Part of an iteration's motion that the next one takes back, from which steps are shortened: with 1 they diverge,
         and below .5 each halves the error (derived).
@@ -64,8 +67,8 @@ class SolverConstants:
         lost 19 parts in 20 of its area, is no match. Chosen.
     smoothness
         Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian.
-        Chosen; with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at
-        most, beside a gap by 7e-4 and 6e-3.
+        Chosen; with a tenth or ten times of it lights under a reflection differ by 2e-6 px at most, beside a gap by
+        3e-4, nodes between two bodies by .3 of their stated uncertainty.
     ridge
         Multiple of the identity, relative to the same, that fixes the constant which the smoothness leaves free where
         nothing is seen: 1e5 times less than the smoothness, 1e7 times more than rounding (derived).
@@ -83,7 +86,7 @@ class SolverConstants:
         Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match.
     min_isotropy
         Texture in the worse direction over that in the better one under which the former may be noise... Chosen; half
-        or twice of it matters in a deep shadow only.
+        or twice of it matters beside a hole only, by .04 of the stated uncertainty.
     max_noise_fraction
         ...and is, if noise alone would give this fraction of it: displacements along it are 30 % too small (derived).
     zncc_bounds, zncc_bounds_precise
@@ -91,12 +94,13 @@ class SolverConstants:
         where the lights count alike, and where they count by their precision, so that a reflection in one of them is no
         mismatch. Chosen.
     outlier_factor
-        In between: how many times farther from 1 than the median of the elements around. Chosen; with half or twice of
-        it lights do not change.
+        In between: how many times farther from 1 than the median of the elements around. Chosen; half or twice of it
+        matters beside a hole, between two bodies and in a deep shadow only, by .08 to .2 of the stated uncertainty.
     neighbour_count
         Elements around: a square of some 5.5 elements a side, of which a crack takes a third.
     max_relative_stretch
-        Stretch (norm of C) beyond that of the elements around from which an element is torn, not strained: a strain of
+        Stretch (norm of C - 1, C the right Cauchy-Green tensor) beyond that of the elements around from which an
+        element is torn, not strained: a strain of
         20 % in both directions more than theirs gives .6.
     gradient_correlation_bounds
         Correlation of a light's gradient with that of the others, in a window, up to which it is matched with the mean
@@ -120,7 +124,8 @@ class SolverConstants:
         Least local gain over that of the light: where a shadow takes 95 % of it, it is not amplified any further.
     gain_window_factor
         Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 noise-free coarse
-        speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py).
+        speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py). Half or
+        twice of it changes displacements by .2 to .5 of their stated uncertainty, in a deep shadow by all of it.
     min_gain_window
         ... and at least, px: one and a half blocks of its grid.
     min_block_side
@@ -139,18 +144,19 @@ class SolverConstants:
         projection of the others (derived).
     score_range
         Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to
-        12 % (derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their
-        uncertainty by 10 %.
+        12 % (derived). With half or twice of it lights differ by 1e-3 px at most, beside a gap by 2e-3, their
+        uncertainty by 5 %.
     min_residual_leverage
         Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px
         leave 0.1).
     information_smoothing
         Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or
-        twice of it lights differ by 1e-4 px at most, beside a gap by 4e-3, their uncertainty by 4 %.
+        twice of it lights differ by 1e-4 px at most, beside a gap by 2e-4, their uncertainty by 3 %.
     prior_blocks
         Blocks for which the region's typical score counts in that window: beside a hole there are few.
     bias_range
-        Standard deviation (px) of the window in which a light's bias is found: it changes over some 50 px, and the mean
+        Standard deviation (px) of the window in which a light's bias is found, and how far what it alone shows follows
+        the solution: it changes over some 50 px, and the mean
         of the lights that agree is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger
         on raised droplets.
     local_bias_range
@@ -216,4 +222,4 @@ class SolverConstants:
 
 
 USUAL = SolverConstants()
-"""The constants as they are used where nobody states others."""
+"""The constants that are used by default."""

@@ -302,14 +302,12 @@ def compare(problem: Problem, estimate: Estimate) -> Residual:
 def iterate(
     problem: Problem, equations: Equations, residual: Residual, estimate: Estimate, tolerance: float
 ) -> Estimate:
-    """Iterate with one Hessian until no textured node moves by more than `tolerance`.
+    """Iterate with one Hessian until no textured node moves by more than `tolerance`, or nine tenths of them do not.
 
     Parameters
     ----------
     problem, equations
         What is solved, and the equations of the pass.
-    values : ndarray, shape (k, P), float32
-        Reference grey levels.
     residual
         At the `estimate`.
     estimate

@@ -136,8 +136,8 @@ class SlidingWindow:
     ----------
     sigma
         Its standard deviation, px: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
-        narrow beside a reflection. Chosen; with half or twice of it in all statistics lights under one differ by 4e-3
-        px at most, beside a gap by .1 px, their uncertainty by 7 % (benchmarks/constants.py).
+        narrow beside a reflection. Chosen; with half or twice of it in the weights lights under one differ by 3e-3 px
+        at most, beside a gap by 6e-3 px, their uncertainty by 8 % (benchmarks/constants.py).
     step
         Side of the blocks, px: half the standard deviation, to which it adds 1 %.
     """
@@ -172,4 +172,4 @@ class SlidingWindow:
 
 
 WINDOW = SlidingWindow()
-"""The window as it is used where nobody states another."""
+"""The window that is used by default."""

@@ -175,7 +175,7 @@ class Reference:
     residual_leverage : float, or ndarray of shape (E,) on a graded mesh
         Fraction of the variance of a block's score that the fit leaves in the residual (`mean_residual_leverage`).
     values, pixel_weights : ndarray, shape (k, P), float32
-        The same at the owned pixels.
+        The same at the owned pixels; the values with what `filtered_as` changes, the weights 0 where a light is dark.
     inverse_level : ndarray, shape (k, P), float32
         One over the local mean of `values`, in units of which residual and gradient are.
     brightness
@@ -183,9 +183,9 @@ class Reference:
     gain_fits : tuple of GainFit
         Of each light's local gain with the `pixel_weights`; empty where the gain is one number.
     gradient : ndarray, shape (2, k, P), float32
-        Gradient of the texture common to the lights, as each shows it, in its `level` per px; without what is a gain.
+        Gradient of the texture common to the lights, as each shows it, in local means per px; without what is a gain.
     texture : TextureGradient
-        Where it is from.
+        What it is computed from.
     prefilter : str
         One of `PREFILTERS`.
     constants : SolverConstants

@@ -1,8 +1,8 @@
-"""The residual f - g(x + u) of every light at a displacement, and the brightness and contrast that enter it.
+"""The residual f - g(x + u) of every light at a displacement, and the change of brightness between the states.
 
-The grey-level correction brings the reference to the brightness and contrast of the deformed images (paper, section
-2.2). The brightness change is reported for every light: lamps flicker, shutters jitter, a light goes out. What the
-residual shows of the motion beyond an initial guess brings that nearer.
+The grey-level correction brings the deformed images to the brightness of the reference (paper, section 2.2;
+`rgbmidic.correlation.brightness`). The brightness change is reported for every light: lamps flicker, shutters jitter, a
+light goes out. What the residual shows of the motion beyond an initial guess brings that nearer.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def brightness_change(
     Parameters
     ----------
     first, second : ndarray, shape (k, H, W)
-        Images of the two states in grey levels, before any normalisation, of one size or not; NaN where unknown.
+        Images of the two states in grey levels, of one size or not; NaN where unknown.
     reference
         Mesh and pixels of the reference state.
     displacement : ndarray, shape (N, 2)

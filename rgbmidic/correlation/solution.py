@@ -85,8 +85,8 @@ class Solution(HtmlRepr):
         Coefficients beta of the rigid functions of each light (0 for the first, NaN for a light that sees nothing):
         shift in x and y in px, then rotation in rad about the middle of the mesh.
     residual : ndarray, shape (k,), float64
-        Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
-        no weight.
+        Weighted rms of ``f - g(x + u)`` of each light, corrected for brightness, over the local mean of f; NaN where a
+        light has no weight.
     weight_fraction : ndarray, shape (k,), float64
         Mean over the pixels of the region of each light's fraction of the sum of the weights; adds up to the part of
         the region that any light sees.

@@ -1,14 +1,15 @@
 """The MIDIC solve: Gauss-Newton on the weighted sum over the lights (paper, eq. 3), in passes with new weights.
 
-Minimised over the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first:
-``sum_j integral (g_j(x + u + R beta_j) - f_j(x))^2 p_j dx``. A rigid motion is linear in x, so it lies in the TRI3
-space: the light's own nodal displacement is ``u + R beta_j`` and its derivative is the light's Hessian times R.
-The gradient of the reference image stands for that of the deformed one, turned by the surface's own rotation, so the
-Hessian is constant within a pass.
+The unknowns are the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first,
+of the criterion ``sum_j sum_x p_j r_j(x)^2``. The residual r_j is the difference of f_j(x) and g_j(x + u + R beta_j),
+corrected for brightness. A rigid motion is linear in x, so it lies in the TRI3 space: the nodal displacement of light j
+is ``u + R beta_j`` and its derivative is the light's Hessian times R. The gradient of the reference image stands for
+that of the deformed one, carried along by the deformation gradient of the surface, so the Hessian is constant within a
+pass (docs: how it works).
 
-One pass after the other: compare the states -> match -> weigh -> equations -> iterate; then conclude. Every step is a
-function from frozen states to a frozen state. A `Weighting` holds what a pass begins with: which elements match, how
-precise each light is, and which grey levels the reference has.
+One pass after the other: equations -> iterate -> compare the states -> match -> weigh; then conclude. Every step is a
+function from frozen states to a frozen state. A `Weighting` holds what a pass begins with: the residual, which elements
+match, and how precise each light is.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weighting:
-    """Elements, lights and grey levels of a pass, as the residual at an estimate determines them.
+    """Elements and lights of a pass, as the residual at an estimate determines them.
 
     Attributes
     ----------
@@ -54,9 +55,9 @@ class Weighting:
     precision
         Of the lights; None: not learnt.
     reweight_until : int
-        Number of the pass after the last one in which elements took part again.
+        The passes up to the one after this number begin with weights that are learnt anew.
     weighting_displacement : ndarray, shape (N, 2)
-        Displacement at which precision and grey levels were learnt, px.
+        Displacement at which the precision was learnt, px.
     """
 
     residual: Residual
@@ -93,7 +94,7 @@ def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | N
 def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:
-    """Find matching, grey levels and precision anew at the displacement found by pass `number`."""
+    """Find residual, matching and precision anew at the displacement found by pass `number`."""
     residual, method = compare(problem, estimate), problem.method
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
@@ -132,10 +133,11 @@ def _lost_nodes(
 
 
 def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, estimate: Estimate, number: int) -> int:
-    """Return the pass up to which the weights are learnt anew.
+    """Return `Weighting.reweight_until` for the next pass.
 
     Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
-    pass in which they do the residual is still that of a wrong match. It is learnt once more where it was elsewhere.
+    pass in which they do the residual is still that of a wrong match. It is learnt once more where the nodes have moved
+    since.
     """
     if (matched & ~last.matched).any():
         return number + 1
@@ -160,7 +162,7 @@ def weights_converged(weighting: Weighting, equations: Equations) -> bool:
 
 
 def is_reweighting(problem: Problem, weighting: Weighting, number: int) -> bool:
-    """Return True if the residual of a pass still changes weights or grey levels."""
+    """Return True if pass `number` begins with weights that are learnt anew."""
     return problem.method is not None and number <= weighting.reweight_until + 1
 
 
@@ -181,7 +183,7 @@ def solve(
     initial : ndarray, shape (N, 2)
         Initial guess of the displacement (u, v) in px, within 8 px of the solution.
     options
-        Rigid functions, grey-level correction, tolerance and iterations.
+        Rigid functions, tolerance and iterations; prefilter and brightness are those of the two states.
     method
         Learns the lights' precision from the residual, such as `rgbmidic.weights.Statistics`; None leaves the weights
         as they are given.

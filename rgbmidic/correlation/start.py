@@ -1,12 +1,12 @@
 """Initial guesses of the displacement, however large the motion, and the tracking of one frame after another.
 
-A frame starts from the last one's displacement, and from a search where that fails. The search compares pictures of
-both states, reduced 8 times, then 4, 2 and 1 times. The lights' images are locally normalised (so that reflections and
-shading weigh little) and averaged into one picture per state. Its keypoints (SIFT: Lowe, Int. J. Comput. Vision 60,
-2004) are paired by their descriptors, which change little under shift, rotation and moderate strain. Angle and size of
-a pair give the turn and stretch of its surroundings; it counts if the pairs around it have moved accordingly. The nodes
-follow the pairs around them by a robust local affine fit. The confidence of such an initial guess is the fraction of
-the nodes around which the images then agree.
+A frame starts from the last one's displacement, and from a search where that fails or loses nodes. The search compares
+pictures of both states, reduced 8 times, then 4, 2 and, of small regions, 1 times. The lights' images are locally
+normalised (so that reflections and shading weigh little) and averaged into one picture per state. Its keypoints (SIFT:
+Lowe, Int. J. Comput. Vision 60, 2004) are paired by their descriptors, which change little under shift, rotation and
+moderate strain. Angle and size of a pair give the turn and stretch of its surroundings; it counts if the pairs around
+it have moved accordingly. The nodes follow the pairs around them by a robust local affine fit. The confidence of such
+an initial guess is the fraction of the nodes around which the images then agree.
 """
 
 from __future__ import annotations
@@ -78,10 +78,10 @@ class Search:
     ----------
     normalise
         Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
-        results differ by 4e-5 px at most (benchmarks/constants.py).
+        results differ by 5e-4 px at most, by more between two bodies and in a deep shadow (benchmarks/constants.py).
     flat
         Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
-        or twice of it results differ by 4e-6 px at most (benchmarks/constants.py).
+        or twice of it results differ by 2e-4 px at most, elsewhere as above (benchmarks/constants.py).
     grey
         Grey levels of the picture's local standard deviation: three of them fit into 8 bits.
     contrast
@@ -108,7 +108,7 @@ class Search:
         Most keypoints of the deformed image, where there are as many per area.
     context
         Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
-        differ by 2e-5 px at most (benchmarks/constants.py).
+        differ by 1.3e-3 px at most, elsewhere as above (benchmarks/constants.py).
     min_confidence
         Confidence from which an initial guess is worth a solve: another specimen gives at most .1
         (benchmarks/starts.py).

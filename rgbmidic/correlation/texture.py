@@ -1,9 +1,10 @@
 """Gradient of the texture that the lights have in common, as each of them shows it.
 
-A light is matched with the mean gradient of the *other* lights. What one light alone shows (the sparkle of its
-reflection, what the lattice of its camera colour makes of it) is in its own gradient and in its own residual alike.
-Their product does not average out: it pulls to whole pixels, and to where a sparkle has stayed that does not follow the
-surface. The others' gradient is an instrument in the statistical sense: it knows the texture and nothing of that.
+Of three lights or more, each is matched with the mean gradient of the *others*; of two with the mean of both. What one
+light alone shows (the sparkle of its reflection, what the lattice of its camera colour makes of it) is in its own
+gradient and in its own residual alike. Their product does not average out: it pulls to whole pixels, and to where a
+sparkle has stayed that does not follow the surface. The others' gradient is an instrument in the statistical sense: it
+knows the texture and nothing of that.
 
 Where the lights' gradients differ the instrument is weak, and errors of the separation, which cancel in the mean of the
 lights, cancel only under one gradient for all. There it is the mean of all lights, unless what a light alone shows is
@@ -32,7 +33,7 @@ class TextureGradient:
     Attributes
     ----------
     images : ndarray, shape (2, k, P), float32
-        Gradient of each light's image, in grey levels per px.
+        Gradient of each light's image, in local means per px, without what is a gain.
     texture : ndarray, shape (2, P), float32
         Sum of it over the lights; where some have no weight, k times the mean of the others.
     in_others : ndarray, shape (k, h, w), float32

@@ -198,9 +198,9 @@ def standard_uncertainty(
 ) -> FloatArray:
     """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
-    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs: uncertainty), and what the
-    rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
-    textured, too.
+    The covariance is ``F M^-1 S M^-1 F^T`` with S the covariance of the right-hand side and F the deformation gradient
+    (docs: uncertainty), and what the rigid motions of the lights add. Displacement is stated at the textured nodes,
+    strain where all nodes around are textured, too.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ class CrackTipConstants:
     ----------
     inner
         Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 %
-        (measured, docs/how-to/results.md).
+        (measured).
     straight
         Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path.
     most_terms

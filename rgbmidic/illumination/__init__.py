@@ -1,4 +1,4 @@
-"""Raw mosaic to illumination images: linearise, demosaic, unmix, reflection index, weights.
+"""From a raw frame to one image per light: linearise, demosaic, unmix; calibration and checks of a frame.
 
 The names below are imported on first use.
 """

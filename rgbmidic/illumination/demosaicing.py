@@ -146,7 +146,7 @@ def reconstruct(
         The speckle's autocorrelation; None learns it from the frame. Frames of one test should share one.
     mixing : (n, 3), or None
         Mixtures of the channels to give instead of them; not valid where a channel that matters in one
-        (`rgbmidic.illumination.crosstalk.needed`) is not.
+        (`rgbmidic.illumination.crosstalk.required_channels`) is not.
     tables
         Where the filters of a test are kept; None: they are made anew.
 

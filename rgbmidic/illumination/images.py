@@ -1,10 +1,7 @@
-"""Images of one mechanical state, one per light: their registration, and their division by the local mean.
+"""Images of one mechanical state, one per light: their registration, their validity, and means around a pixel.
 
-Lights and illuminations are the same. A body that turns under fixed lights grows brighter or darker smoothly, and a
-reflection lifts the mean; dividing by the local mean leaves the texture, which is what moves with the surface.
-
-A lens magnifies each wavelength a little differently. With x the pixel of a material point in the first light's image
-and c the image centre, light j sees the same point at x + rho_j(x),
+Lights and illuminations are the same. A lens magnifies each wavelength a little differently. With x the pixel of a
+material point in the first light's image and c the image centre, light j sees the same point at x + rho_j(x),
 
     rho_j(x) = t + w J (x - c) + s (x - c) + q (|x - c| / R)^2 (x - c),    J (x, y) = (-y, x).
 """

@@ -36,7 +36,7 @@ WHITE_ENERGY = float((_BINOMIAL[::2] ** 2).sum() ** 2)
 
 
 class BandEnergy(NamedTuple):
-    """Second moments of the planes' low-passed contrast, `cell_moments` of the kernels, for unit texture.
+    """Second moments of the planes' low-passed contrast, `plane_products` of the kernels, for unit texture.
 
     Attributes
     ----------

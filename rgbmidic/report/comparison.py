@@ -43,8 +43,8 @@ class ComparisonConstants:
     max_rigid_ratio
         Standard uncertainties of a rigid motion above which a warning names the frame. Chosen.
     max_chi_square
-        Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more
-        than that is wrong by in any scene of docs/explanation/uncertainty.md.
+        Chi-square of what the best scale leaves above which the shape differs: errors of 1.2 times the stated
+        uncertainty, which hardly any whole field of docs/explanation/uncertainty.md exceeds.
     """
 
     map_count: int = 2

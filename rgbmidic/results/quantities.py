@@ -332,8 +332,7 @@ _TABLE = (
     ResultQuantity("light_fraction", ("node", "light"), "", "light_fraction",
         "fraction of each light in the information that determines a node", blank=0),
     ResultQuantity("residual", _LIGHT, "", "residual",
-        "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
-        "local mean (the default), else DN"),
+        "weighted rms of `f - g(x + u)`, corrected for brightness, over the local mean of f"),
     ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction",
         "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
     ResultQuantity("brightness", ("light", 2), "", "",

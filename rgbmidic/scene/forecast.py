@@ -3,9 +3,10 @@
 The covariance of the nodes is ``M^-1 S M^-1`` with M the Hessian of the weighted sum over the lights and S the
 covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Per pixel, M has the
 density `information` = energy of the speckle's gradient x precision x contrast, with the precision of a light its
-contrast over the variance of its residual (`light_precision`, as the main job weights by default); S has the density
-`score` of the errors of the images times the precisions. From the two densities follows the uncertainty of an inner
-node of a regular mesh (`nodal_variance_factor`), or of every node of a mesh over which they vary (`expected_std`).
+contrast over the variance of its residual (`light_precision`; the solve takes the residuals' covariance); S has the
+density `score` of the errors of the images times the precisions. From the two densities follows the uncertainty of an
+inner node of a regular mesh (`nodal_variance_factor`), or of every node of a mesh over which they vary
+(`expected_std`).
 
 The densities come from a scene (`Instrument`, here) or from a frame (`rgbmidic.lab.inspection.prediction`). Those of a
 scene are integrals of the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of

@@ -352,16 +352,16 @@ class Statistics(ValidPixels):
     ----------
     freedom
         Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84,
-        1989, who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap
-        by 4e-2, their uncertainty by 11 % (benchmarks/constants.py).
+        1989, who found 4 to work well). With 2 or 8 lights under a reflection differ by 3e-3 px at most, beside a gap
+        by 5e-3, their uncertainty by 4 % (benchmarks/constants.py).
     least_variance
-        Least variance of a light's residual that is believed, over the median of all. Chosen; with half or twice of it
-        lights under a reflection do not change, those beside a gap by half their uncertainty, that by 59 %
-        (benchmarks/constants.py).
+        Least variance of a light's residual that is believed, over the median of all. Chosen; half or twice of it
+        changes nothing (benchmarks/constants.py).
     rounding
         Least variance of a residual, over that of the grey levels, where two images are the same: none is 0.
     independent_fraction
-        Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same.
+        Fraction of its variance that each light's residual is taken to have for itself. Chosen; with half or twice of
+        it lights differ by 2e-4 px at most (benchmarks/constants.py).
     window
         In which variances are found.
     """

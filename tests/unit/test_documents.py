@@ -124,6 +124,27 @@ def test_links_between_the_documents_lead_somewhere():
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+FORMER_KEYS = {"illumination.normalise"}
+ENDINGS = {"npz", "json", "toml", "py", "csv"}
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_keys_options_and_files_that_a_page_mentions_exist(page):
+    """Names of the code are looked up by tests/examples/test_pages.py."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    keys = {f"{name}.{entry.name}" for name, kind in section_types().items() for entry in fields(kind)} | FORMER_KEYS
+    sources = [*ROOT.glob("rgbmidic/c*.py"), *ROOT.glob("*/__main__.py"), ROOT / "examples/paper/run.py"]
+    sources += [ROOT / "tests/conftest.py", *DOCS.glob("reference/*commands.md")]
+    options = set(re.findall(r"--[a-z][a-z-]*", "\n".join(file.read_text(encoding="utf-8") for file in sources)))
+    for quoted in re.findall(r"`([^`\n]+)`", text):
+        if (key := re.match(rf"({'|'.join(section_types())})\.(\w+)", quoted)) and key[2] not in ENDINGS:
+            assert key[0] in keys, quoted
+        if quoted.startswith(("rgbmidic", "--", "python -m benchmarks", "pytest")):
+            assert set(re.findall(r"(?<!\S)--[a-z][a-z-]*", quoted)) <= options, quoted
+        if re.fullmatch(r"(rgbmidic|calibration|tests|benchmarks|examples|docs)/[\w/.-]+", quoted):
+            assert (ROOT / quoted).exists(), quoted
+
+
 RULED_OUT = [
     r"\b(bring\w*|brought) .{0,20}\bback\b",  # warp
     r"\bshares? of (a|the|its|each|every)\b",  # fraction, relative weight

@@ -8,6 +8,7 @@ names that this project bound; the code of scikit-fem, zarr and lmfit has 0.6 to
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -104,6 +105,66 @@ def test_no_summary_is_a_fragment(room: str) -> None:
         if summary.startswith(FRAGMENTS)
     ]
     assert not fragments
+
+
+QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
+ELSEWHERE = ("numpy.", "eHBayerPatternOrigin", "x_image", "y_image")
+"""Names of another package, of a camera's header, and those that a result's axes are put together to."""
+
+
+def quoted_names(tree: ast.AST) -> Iterator[str]:
+    """Yield the names in quotes of the docstrings of a module, attributes included."""
+    for node in ast.walk(tree):
+        for statement in getattr(node, "body", None) if isinstance(getattr(node, "body", None), list) else ():
+            match statement:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    yield from QUOTED.findall(text)
+
+
+@cache
+def identifiers() -> frozenset[str]:
+    """Names that the code has: bound, looked up, imported, keys in quotes, and modules."""
+    found = set[str]()
+    for path, tree in (module for modules in rooms().values() for module in modules):
+        found |= {path.stem, path.parent.name}
+        for node in ast.walk(tree):
+            found.update(re.findall(r"\w+", str(getattr(node, "asname", None) or getattr(node, "name", ""))))
+            found |= {str(getattr(node, field)) for field in ("id", "attr", "arg") if hasattr(node, field)}
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.isidentifier():
+                found.add(node.value)
+    return frozenset(found)
+
+
+def is_defined(name: str) -> bool:
+    """Return True if a name exists; of `rgbmidic.package.module.name` the last one in that very module."""
+    if not name.startswith("rgbmidic"):
+        return set(name.split(".")) <= identifiers()
+    root = Path(rgbmidic.__file__ if name.startswith("rgbmidic.") else rgbmidic_calibration.__file__).parent
+    path, parts = root, name.split(".")[1:]
+    while parts and ((path / parts[0]).is_dir() or (path / f"{parts[0]}.py").is_file()):
+        path /= parts.pop(0)
+    source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return not parts or (
+        re.search(rf"\b{parts[0]}\b", source.read_text(encoding="utf-8")) is not None and set(parts) <= identifiers()
+    )
+
+
+@pytest.mark.parametrize("room", renamed_rooms())
+def test_names_that_docstrings_quote_exist(room: str) -> None:
+    quoted = [(name, path.name) for path, tree in rooms()[room] for name in quoted_names(tree)]
+    missing = [f"{file}: {name}" for name, file in quoted if not name.startswith(ELSEWHERE) and not is_defined(name)]
+    assert not missing
+
+
+def test_a_quoted_name_that_is_not_there_is_found_out() -> None:
+    assert list(quoted_names(ast.parse('"""Not `that_is_gone`, ``code`` or `Residual.at(x)`."""'))) == [
+        "that_is_gone",
+        "Residual.at",
+    ]
+    assert is_defined("Residual.at")
+    assert is_defined("rgbmidic.correlation.solve")
+    assert not is_defined("that_is_" + "gone")
+    assert not is_defined("rgbmidic.illumination.crosstalk.needed")
 
 
 def test_riddles_and_fragments_are_recognised() -> None:

@@ -27,7 +27,7 @@ from rgbmidic.settings import TestSettings
 SHAPE = (800, 1000)
 REGION = (300, 560, 399, 639)
 LIGHTS = ("red", "green", "blue")
-ROUNDING = 5e-5
+ROUNDING = 2e-5
 """px: what single precision leaves of positions that are counted from another pixel (1.1e-5 measured)."""
 
 Settings = Callable[..., TestSettings]
