@@ -22,12 +22,12 @@ def _read_axes(text: str) -> Any:
     """Return the axes that ``--axes`` states: a word, or three points."""
     if text in ("plane", "camera"):
         return text
-    points = [command.read_coordinates(point, "--axes", "X,Y") for point in text.split(":")]
-    if len(points) != 3:
-        raise InputError(
-            f"--axes is plane, camera or three points X,Y:X,Y:X,Y in px of the left reference, not {text!r}"
-        )
-    return points
+    try:
+        first, second, third = (command.read_coordinates(point, "--axes", "X,Y") for point in text.split(":"))
+    except ValueError:
+        form = "plane, camera or three points X,Y:X,Y:X,Y in px of the left reference"
+        raise InputError(f"--axes is {form}, not {text!r}") from None
+    return first, second, third
 
 
 @app.command()

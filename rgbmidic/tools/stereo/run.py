@@ -16,6 +16,7 @@ from typing import Literal, TypedDict, Unpack
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields import MEASURES
 from rgbmidic.frames import Window
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.illumination.calibration import Calibration
@@ -72,6 +73,17 @@ class StereoSettings:
     gauge: float | None = None
     measure: str = "green-lagrange"
     pairing: Literal["auto", "number"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Check what needs no mesh before anything is measured."""
+        if self.measure not in MEASURES:
+            raise InputError(f'unknown strain measure "{self.measure}"; allowed are {", ".join(MEASURES)}')
+        if self.pairing not in ("auto", "number"):
+            raise InputError(f'frames are paired "auto" or by "number", not {self.pairing!r}')
+        if isinstance(self.axes, str) and self.axes not in ("plane", "camera"):
+            raise InputError(f'axes are "plane", "camera" or three points (x, y) in px, not {self.axes!r}')
+        if self.gauge is not None and not 0 < self.gauge < np.inf:
+            raise InputError(f"a gauge is a length in px above 0, not {self.gauge:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -183,6 +183,12 @@ def test_another_size_is_refused(measured, pair, tmp_path):
         measure_stereo(folder / "left/TEST.toml", folder / "right/TEST.toml", other, tmp_path / "result")
 
 
+@pytest.mark.parametrize("wrong", [{"measure": "true"}, {"pairing": "time"}, {"axes": "world"}, {"gauge": -1.0}])
+def test_settings_that_cannot_be_are_refused_before_anything_is_measured(wrong):
+    with pytest.raises(InputError):
+        StereoSettings(**wrong)
+
+
 def images_of(*values, names=("lamp",)):
     stacks = [np.asarray(value, dtype=np.float32)[None] for value in values]
     return tuple(
