@@ -206,6 +206,11 @@ class Plan:
         finite_elements, placement = None, None
         if settings.mesh.file is not None:
             finite_elements, placement, mesh, region = finite_elements_of(settings, frame)
+        if region is not None and region.mask.shape != frame:
+            height, width = region.mask.shape
+            raise RegionError(
+                f"the region is of frames of {width} x {height} px, the test's have {frame[1]} x {frame[0]}"
+            )
         region, window = region or read_region(settings.region, frame), Window.of_frame(frame)
         if not has_objects and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
