@@ -113,8 +113,15 @@ class _Test:
 
     @property
     def rate(self) -> float | None:
-        """Frames per second, as TEST.toml or else the camera states it."""
-        return self.settings.scale.frame_rate or self.series.recording.frame_rate
+        """Frames per second that are measured, as TEST.toml or else the camera states it."""
+        rate = self.settings.scale.frame_rate or self.series.recording.frame_rate
+        return rate and rate / self.series.selected.step
+
+    @property
+    def references(self) -> list[float]:
+        """Positions of the reference frames, counted from the first that is measured."""
+        selected = self.series.selected
+        return [(index - selected.start) / selected.step for index in self.settings.frames.reference]
 
     @property
     def times(self) -> AnyArray | None:
@@ -244,12 +251,11 @@ def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:
             f"both cameras must have as many frames: {left.name} has {counts[0]}, {right.name} {counts[1]}; choose "
             "them with frames.first, last and step"
         )
-    references = [[test.series.selected.index(i) for i in test.settings.frames.reference if i in test.series.selected]
-                  for test in tests]  # fmt: skip
+    references = [test.references for test in tests]
     if references[0] != references[1]:
         raise InputError(
-            f"frames.reference must name the same frames of both cameras: {left.name} has {references[0]}, "
-            f"{right.name} {references[1]}"
+            f"frames.reference must name the same states of both cameras, counted in frames from frames.first: "
+            f"{left.name} has {references[0]}, {right.name} {references[1]}"
         )
     rates = left.rate, right.rate
     if rates[0] and rates[1] and abs(rates[0] / rates[1] - 1) > 0.01:

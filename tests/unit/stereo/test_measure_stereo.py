@@ -138,7 +138,7 @@ def test_a_camera_that_moved_is_reported(measured, pair, tmp_path):
 
 CONTRADICTIONS = {
     "frames": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nlast = 1', "as many frames"),
-    "references": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nreference = 1', "must name the same frames"),
+    "references": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nreference = 1', "must name the same states"),
     "region": ("[0, 0, 159, 119]", "[0, 0, 20, 20]", "no element of the left mesh"),
 }
 
