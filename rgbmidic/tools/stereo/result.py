@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 STEREO_FILE = "stereo.vtkhdf"
 _SCHEMA, _VERSION = "rgbmidic-stereo-result", 1
 _NODE, _STATUS = ("node",), ("measured", "not seen", "decorrelated", "filled")
+_DIMENSIONS = ("node", "row", "column")
 _DOUBLE: dict[str, Any] = {"dtype": np.float64}
 
 
@@ -169,9 +170,8 @@ class StereoResult:
         xarray = import_optional("xarray", "xarray")
         variables = {}
         for name, entry in QUANTITIES.items():
-            axes = ("node", "row", "column")[: len(entry.axes)]
             frames = () if entry in _SHARED else ("time",)
-            variables[name] = ((*frames, *axes), self[name], entry.attributes)
+            variables[name] = ((*frames, *_DIMENSIONS[: len(entry.axes)]), self[name], entry.attributes)
         coordinates = {"time": self.time, "name": ("time", list(self.names))}
         dataset: xr.Dataset = xarray.Dataset(variables, coordinates, dict(self.attributes))
         return dataset.set_coords(["x", "y", "z"])
@@ -287,10 +287,14 @@ def write_stereo(
         out["time"].attrs["units"] = "1" if times is None else "s"
         out["node"] = np.arange(len(meshes.nodes), dtype=np.int32)
         out["element"] = np.arange(len(meshes.left.elements), dtype=np.int32)
-        for name in ("time", "node", "element"):
+        for name, length in {"corner": 3, "row": 3, "column": 3}.items():
+            out[name] = np.arange(length, dtype=np.int32)
+        for name in ("time", "node", "element", "corner", "row", "column"):
             out[name].make_scale(name)
-        out.create_dataset("name", data=np.array(list(names), dtype=text))
+        out.create_dataset("name", data=np.array(list(names), dtype=text)).dims[0].attach_scale(out["time"])
         out["elements"] = meshes.left.elements
+        for axis, name in zip(out["elements"].dims, ("element", "corner"), strict=True):
+            axis.attach_scale(out[name])
         for name, array in _shared_values(shape).items():
             _add(out, QUANTITIES[name], data=array.astype(QUANTITIES[name].dtype))
         for entry in _OF_FRAMES:
@@ -327,8 +331,8 @@ def _shared_values(shape: Shape) -> dict[str, AnyArray]:
 def _add(out: h5py.File, entry: ResultQuantity, **content: Any) -> None:
     dataset = out.create_dataset(entry.name, **content)
     dataset.attrs.update(entry.attributes)
-    scales = ("node",) if entry in _SHARED else ("time", "node")
-    for axis, name in zip(dataset.dims, scales, strict=False):
+    frames = () if entry in _SHARED else ("time",)
+    for axis, name in zip(dataset.dims, (*frames, *_DIMENSIONS[: len(entry.axes)]), strict=True):
         axis.attach_scale(out[name])
 
 

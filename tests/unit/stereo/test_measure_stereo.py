@@ -78,6 +78,7 @@ def test_both_results_are_ordinary_ones_on_the_same_material_points(measured, pa
 
 def test_the_file_is_read_by_others(measured, tmp_path):
     import h5py
+    import xarray
 
     _, result = measured
     nodes = len(result["x"])
@@ -90,6 +91,8 @@ def test_the_file_is_read_by_others(measured, tmp_path):
         assert grid["PointData/exx"].shape == (3 * nodes,)
         assert list(grid["Steps/PointDataOffsets/exx"]) == [0, nodes, 2 * nodes]
         assert list(grid["Steps/PointDataOffsets/z_std"]) == [0, 0, 0]
+    opened = xarray.open_dataset(result.path, engine="h5netcdf")
+    assert opened.displacement_covariance.dims == ("time", "node", "row", "column")
     dataset = result.to_xarray()
     assert dataset.w.dims == ("time", "node")
     assert dataset.w.attrs["units"] == "mm"
