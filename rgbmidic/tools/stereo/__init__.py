@@ -5,6 +5,7 @@ material point in both; both displacements are triangulated frame by frame with 
 """
 
 from rgbmidic.tools.stereo.axes import Axes
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh, carry_mesh
 from rgbmidic.tools.stereo.result import QUANTITIES, StereoResult
@@ -17,6 +18,7 @@ __all__ = [
     "PAIR_PARAMETERS",
     "QUANTITIES",
     "Axes",
+    "CalibrationPart",
     "CameraPair",
     "CarriedMesh",
     "Shape",

@@ -143,8 +143,11 @@ class CameraPair:
         product = np.outer(scale, scale)
         relative = np.divide(self.covariance, product, out=np.zeros_like(product), where=product > 0)
         variances, vectors = np.linalg.eigh(relative)
+        at_rest = function(self)
         slopes = [
             (function(self.with_parameters(values + step)) - function(self.with_parameters(values - step))) / 2
+            if step.any()
+            else np.zeros_like(at_rest)
             for step in np.diag(scale)
         ]
         return np.asarray(np.stack(slopes, axis=-1) @ vectors * np.sqrt(np.maximum(variances, 0)))

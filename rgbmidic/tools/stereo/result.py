@@ -47,7 +47,7 @@ _SHARED = [
     ResultQuantity("y_right", _NODE, "px", "", "node in the right reference, down", **_DOUBLE),
     ResultQuantity("left_node", _NODE, "", "", "index of the node in the left result", dtype=np.int32),
     *_with_std("xyz", "mm", "coordinate {} of the undeformed surface", **_DOUBLE),
-    ResultQuantity("shape_covariance", ("node", 3, 3), "mm^2", "", "covariance of x, y, z by the match of references"),
+    ResultQuantity("shape_covariance", ("node", 3, 3), "mm^2", "", "covariance of x, y, z"),
     *_with_std(["epipolar_common"], "px", "epipolar residual of the reference states, common to all frames"),
 ]
 """Quantities that all frames share."""

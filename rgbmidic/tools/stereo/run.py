@@ -201,7 +201,7 @@ def measure_stereo(
         "axes_rotation": shape.axes.rotation,
         "gauge_px": shape.gauges.gauges.length,
         "measure": settings.measure,
-        "relative_length_std": float(shape.calibration_std[0]),
+        "relative_length_std": shape.calibration.length_std,
         "left": str(first.path.resolve()),
         "right": str(second.path.resolve()),
         "calibration": json.dumps({"name": pair.name, "parameters": pair.parameters.tolist()}),

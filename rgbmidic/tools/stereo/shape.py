@@ -11,6 +11,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
 from rgbmidic.tools.stereo.surface import SurfaceGauges
@@ -20,8 +21,6 @@ from rgbmidic.typing import AnyArray, FloatArray
 _EXACT = 1e-4
 """Standard uncertainty (px) of what is exact by definition: a node in the left reference, a frame that is the only
 reference. Weights stay finite; it is a tenth of the smallest that is stated of a match."""
-_CORRELATED = 200
-"""Nodes in which the part of the calibration is taken: it is smooth over the frame (lens and pose)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,12 +60,11 @@ class Shape:
     axes
         In which results are.
     points, covariance : ndarray, shapes (N, 3) and (N, 3, 3)
-        The surface in these axes, mm, and its covariance by the match of the references.
+        The surface in these axes, mm, and its covariance by the match of the references and the calibration.
     gauges
         Of the surface strain.
-    calibration_std : ndarray, shape (2,)
-        Relative standard uncertainty of lengths on the surface, and standard uncertainty (px, rms) of the epipolar
-        residual, that the calibration leaves.
+    calibration
+        The part of the calibration.
     """
 
     pair: CameraPair
@@ -76,7 +74,7 @@ class Shape:
     points: FloatArray
     covariance: FloatArray
     gauges: SurfaceGauges
-    calibration_std: FloatArray
+    calibration: CalibrationPart
 
     @classmethod
     def of(
@@ -118,24 +116,16 @@ class Shape:
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
-        sampled = slice(None, None, len(points) // _CORRELATED + 1)
-
-        def uncertain(perturbed: CameraPair) -> FloatArray:
-            triangulated = triangulate(perturbed, pixels[0][sampled], pixels[1][sampled], spread[sampled])
-            extent = np.linalg.norm(triangulated.points - triangulated.points.mean(axis=0), axis=1)
-            return np.asarray(np.r_[np.log(np.sqrt(np.mean(extent**2))), triangulated.residual])
-
-        errors = pair.sensitivity(uncertain)
-        scale_std, residual_std = np.linalg.norm(errors[0]), np.sqrt((errors[1:] ** 2).sum(axis=1).mean())
+        calibration = CalibrationPart.of(pair, carried_mesh.left, shape, spread, axes)
         return cls(
             pair=pair,
             carried_mesh=carried_mesh,
             triangulation=shape,
             axes=axes_in_space,
             points=points,
-            covariance=axes_in_space.covariance(shape.covariance),
+            covariance=axes_in_space.covariance(shape.covariance) + calibration.shape_covariance,
             gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
-            calibration_std=np.array([scale_std, residual_std]),
+            calibration=calibration,
         )
 
     def frame(self, left: Mapping[str, Any], right: Mapping[str, Any]) -> dict[str, AnyArray]:
@@ -165,6 +155,7 @@ class Shape:
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
         covariance = self.axes.covariance(deformed.covariance)
         strain, normal = self.gauges.strain(displacement, covariance)
+        covariance = covariance + self.calibration.displacement_covariance(displacement)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
@@ -199,7 +190,7 @@ class Shape:
         """
         shape = self.triangulation
         common = float(np.sqrt(np.mean(shape.residual**2)))
-        common_std = float(np.sqrt(np.mean(shape.residual_std**2) + self.calibration_std[1] ** 2))
+        common_std = float(np.sqrt(np.mean(shape.residual_std**2) + self.calibration.epipolar_std**2))
         if common > max(LIMITS.residual, LIMITS.factor * common_std):
             yield (
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {common_std:.3f} px: "
