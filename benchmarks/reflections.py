@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
-from bench import SMALLEST, Bench
+from bench import Bench
+from measurement import SceneStudy
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.images import local_mean
 from rgbmidic.typing import AnyArray, FloatArray
 from run import run_scene
 
 from .contenders import CONTENDERS, MODULES
+from .study import bench_study
 from .tables import MissingDataError, Row, table
 from .uncertainty import rms
 
@@ -36,6 +39,13 @@ LOST = 2.0
 """Error (px) beyond which a point of another program is counted as not found instead."""
 
 
+def studies_of(name: str, angles: tuple[float, ...], quick: bool, **settings: Any) -> list[SceneStudy]:
+    """One study of a bench for each seed; quick: those of the paper's experiment, one seed with every method."""
+    if quick:
+        return [replace(study, angles=angles) for study in bench_study(True).scenes]
+    return [run_scene(Bench.build(name, SIZE, seed=seed), angles, **settings) for seed in SEEDS]
+
+
 @table(
     "reflections", page="explanation/polarisers", cost=200, own_quick=True, within={"areas within 1.3 A0 [%]": 200 / 4}
 )
@@ -44,15 +54,7 @@ def reflections(quick: bool) -> Iterator[Row]:
     lamps are seen through a lens with lateral colour of half a pixel at the corners from one lamp to the next."""
     angles = (1.0,) if quick else ANGLES
     for name in ("sequential",) if quick else LIGHTS:
-        studies = [
-            run_scene(
-                Bench.build(name, SMALLEST if quick else SIZE, seed=seed),
-                angles,
-                methods=tuple(METHODS),
-                **({"set_up": (1.0,)} if quick else {}),
-            )
-            for seed in (SEEDS[:1] if quick else SEEDS)
-        ]
+        studies = studies_of(name, angles, quick, methods=tuple(METHODS))
         for method, title in METHODS.items():
             p, error, ratio = (
                 np.concatenate([study.series(method, quantity) for study in studies])
@@ -77,13 +79,8 @@ def reflections(quick: bool) -> Iterator[Row]:
 def areas(quick: bool) -> Iterator[Row]:
     """The same sphere: error of rgbmidic in each area, and error over stated uncertainty."""
     angles = (1.0,) if quick else (1.0, 8.0)
-    for name in ("sequential",) if quick else LIGHTS:  # quick: rendered for `reflections`, too
-        studies = [
-            run_scene(
-                Bench.build(name, SMALLEST if quick else SIZE, seed=seed), angles, methods=("default",), set_up=()
-            )
-            for seed in (SEEDS[:1] if quick else SEEDS)
-        ]
+    for name in ("sequential",) if quick else LIGHTS:
+        studies = studies_of(name, angles, quick, methods=("default",), set_up=())
         for number, angle in enumerate(angles):
             error, ratio = (
                 np.array([study.series("default", quantity)[number] for study in studies])
@@ -126,7 +123,7 @@ def with_peers(quick: bool) -> Iterator[Row]:
 
 def seen(images: IlluminationImages) -> FloatArray:
     """8-bit pictures (4, H, W) of the lights on the first one's grid and of their mean, over their local mean."""
-    lights = np.stack([image / local_mean(image, 10.0) for image in align(images).values])
+    lights = np.stack([image / local_mean(image, 10.0) for image in images.on_first_light().values])
     every = np.concatenate([lights, lights.mean(axis=0, keepdims=True)])
     return np.asarray(np.nan_to_num(every * 110, nan=110.0).clip(0, 255).round(), dtype=np.float64)
 

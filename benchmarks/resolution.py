@@ -13,6 +13,7 @@ from rgbmidic.fields import at_pixels, field_rms
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import resolution
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.refinement import refine
 from rgbmidic.pipeline.resolution import SPECKLES, study_sizes
 from rgbmidic.settings import FrameSettings, MeshSettings, RegionSettings, TestSettings
 
@@ -215,7 +216,7 @@ def refined_mesh(quick: bool) -> Iterator[Row]:
             plan = Plan.from_settings(
                 replace(drawn.settings(), mesh=MeshSettings(element_size=start)), source=list(states.astype(np.float32))
             )
-            finer = resolution.refine(plan)
+            finer = refine(plan)
             count, mesh = len(finer.reference.mesh.nodes), plan.reference.mesh
             sizes = np.sqrt(mesh.areas.sum() / count) * np.linspace(0.8, 1.25, 19)
             meshes = (Tri3Mesh.from_region(plan.region, size) for size in sizes)

@@ -65,6 +65,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
         *there,
         weight,
         moments,
+        np.empty(elements, dtype=bool),
     )
     channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)

@@ -99,22 +99,47 @@ class HoledPlate:
         return Region.from_rectangle((30, 30, self.size - 31, self.size - 31), (self.size,) * 2).without([edge])
 
 
+class Paint:
+    """Paint of a random texture at any points of a surface of a shape and 200 px around it, .15 to .75."""
+
+    def __init__(self, draw: int, shape: tuple[int, int]) -> None:
+        rng, fine = np.random.default_rng(100 + draw), tuple(_FINE * (size + 400) for size in shape)
+        spots = gaussian_filter(rng.normal(size=fine).astype(np.float32), 1.25 * _FINE, mode="wrap")
+        paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
+        self.coefficients = np.empty([size + 2 * PAD for size in paint.shape], dtype=np.float32)
+        bspline_coefficients(paint, self.coefficients)
+
+    def __call__(self, points: FloatArray) -> FloatImage:
+        """Reflectance (...) at points (..., 2)."""
+        # OpenCV rounds places to 1/32 px: not enough for the truth
+        fine = np.ascontiguousarray(np.moveaxis((points + 200) * _FINE, -1, 0))
+        paint, *slopes = np.empty((3, fine[0].size), dtype=np.float32)
+        sample_with_gradient(self.coefficients, *fine.reshape(2, -1), paint, *slopes)
+        return paint.reshape(fine.shape[1:])
+
+
+def expose(lights: FloatArray, seed: int) -> Mosaic:
+    """Raw frame of lights (3, H, W), of 1 at three quarters of the white level, with the camera's noise."""
+    height, width = lights.shape[1:]
+    site = np.tile(cfa_channels(CFA), (height // 2, width // 2))
+    signal = np.take_along_axis(np.tensordot(CROSSTALK, lights, axes=1), site[None], axis=0)[0]
+    signal *= (WHITE - BLACK) * 0.75
+    noise = np.random.default_rng(seed).normal(size=signal.shape)
+    noisy = signal + noise * np.sqrt(np.maximum(signal, 0) / GAIN + READ_NOISE**2)
+    values = np.clip(np.round(noisy + BLACK), 0, WHITE).astype(np.uint16)
+    return Mosaic(values=values, cfa=CFA, black_level=BLACK, white_level=WHITE)
+
+
 class _Renderer:
     """Frames of such a plate: paint that moves, and glare of each light that stands still."""
 
     def __init__(self, plate: HoledPlate) -> None:
-        self.plate, rng = plate, np.random.default_rng(100 + plate.draw)
-        fine = _FINE * (plate.size + 400)
-        spots = gaussian_filter(rng.normal(size=(fine, fine)).astype(np.float32), 1.25 * _FINE, mode="wrap")
-        paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
-        self.paint = np.empty([size + 2 * PAD for size in paint.shape], dtype=np.float32)
-        bspline_coefficients(paint, self.paint)
+        self.plate, rng = plate, np.random.default_rng(200 + plate.draw)
+        self.paint = Paint(plate.draw, (plate.size, plate.size))
         self.points = np.stack(np.mgrid[: plate.size, : plate.size][::-1].astype(np.float64), axis=-1)
-        self.site = np.tile(cfa_channels(CFA), (plate.size // 2, plate.size // 2))
-        rng = np.random.default_rng(200 + plate.draw)
         self.glare = []
         for spot in plate.spots:
-            grains = sum(gaussian_filter(rng.normal(size=self.site.shape), plate.sparkle) ** 2 for _ in range(2))
+            grains = sum(gaussian_filter(rng.normal(size=(plate.size,) * 2), plate.sparkle) ** 2 for _ in range(2))
             erratic = 1 - plate.erratic + plate.erratic * grains / grains.mean()
             distance = ((self.points - spot) ** 2).sum(axis=-1)
             self.glare.append(0.45 * plate.glare * erratic * np.exp(-distance / (2 * plate.spread**2)))
@@ -124,21 +149,8 @@ class _Renderer:
         seen = self.plate.origin(self.points, number)
         solid = np.clip(np.hypot(*np.moveaxis(seen - self.plate.hole, -1, 0)) - self.plate.radius + 0.5, 0, 1)
         come = min(max(number - self.plate.rest + 1, 0) / self.plate.arrives, 1) if self.plate.arrives else 1.0
-        lights = 0.4 * (solid * (self._paint((seen + 200) * _FINE) + come * np.stack(self.glare)) + 0.03 * (1 - solid))
-        channels = np.tensordot(CROSSTALK, lights, axes=1)
-        signal = np.take_along_axis(channels, self.site[None], axis=0)[0] * (WHITE - BLACK) * 0.75
-        rng = np.random.default_rng(10_000 * (self.plate.draw + 1) + number)
-        noisy = signal + rng.normal(size=signal.shape) * np.sqrt(np.maximum(signal, 0) / GAIN + READ_NOISE**2)
-        values = np.clip(np.round(noisy + BLACK), 0, WHITE).astype(np.uint16)
-        return Mosaic(values=values, cfa=CFA, black_level=BLACK, white_level=WHITE)
-
-    def _paint(self, places: FloatArray) -> FloatImage:
-        # OpenCV rounds places to 1/32 px: not enough for the truth
-        paint, *slopes = np.empty((3, places[..., 0].size), dtype=np.float32)
-        sample_with_gradient(
-            self.paint, *np.ascontiguousarray(np.moveaxis(places, -1, 0)).reshape(2, -1), paint, *slopes
-        )
-        return paint.reshape(self.site.shape)
+        lights = 0.4 * (solid * (self.paint(seen) + come * np.stack(self.glare)) + 0.03 * (1 - solid))
+        return expose(lights, 10_000 * (self.plate.draw + 1) + number)
 
 
 @table("standing_glare", page="explanation/uncertainty", cost=100, keys=1, own_quick=True)

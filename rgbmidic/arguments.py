@@ -5,16 +5,15 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, cast, get_args, get_origin
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
-from rgbmidic.settings.conversion import convert_value, type_hints
+from rgbmidic.settings.conversion import convert_fields, convert_value, type_hints
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -24,8 +23,8 @@ _SIMPLE = (float, int, bool, str, Path)
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Refuse what a function cannot take, before it begins: texts for numbers, arrays of texts, infinite numbers.
 
-    Numbers, texts, tuples of them and arrays are looked at, whose annotations say what they are; shapes, bounds and NaN
-    in an array are the function's own business.
+    Numbers, texts, tuples of them, arrays, mappings and objects of the package's own classes are looked at, whose
+    annotations say what they are; shapes, bounds and NaN in an array are the function's own business.
 
     Raises
     ------
@@ -55,18 +54,20 @@ def check_fields(instance: object, error: type[RgbmidicError] = InputError) -> N
     RgbmidicError
         A field is not of the type of its annotation.
     """
-    hints = type_hints(cast(Any, type(instance)))
-    for entry in fields(cast(Any, instance)):
-        value = getattr(instance, entry.name)
-        label = f"{entry.name} of {type(instance).__name__}"
-        object.__setattr__(instance, entry.name, _converted(value, hints[entry.name], label, error))
+    name = type(instance).__name__
+    convert_fields(instance, lambda entry, value, hint: _converted(value, hint, f"{entry.name} of {name}", error))
 
 
 def _converted(value: Any, hint: Any, label: str, error: type[RgbmidicError]) -> Any:
-    """Value in the type of the annotation; what is neither number, text, tuple nor array, as it is."""
+    """Value in the type of the annotation, as it is where that is none of those that `checked` names."""
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if value is None and NoneType in kinds:
         return None
+    if classes := _classes(kinds):
+        if not isinstance(value, classes):
+            names = " or ".join(kind.__name__ for kind in classes)
+            raise error(f"{label} must be of type {names}, not {value!r:.80}")
+        return value
     if any(str(getattr(get_origin(kind), "__module__", "")).startswith("numpy") for kind in kinds):
         return _array(value, label, error)
     if kinds[0] not in _SIMPLE and get_origin(kinds[0]) not in (tuple, Literal):
@@ -82,6 +83,21 @@ def _converted(value: Any, hint: Any, label: str, error: type[RgbmidicError]) ->
     if isinstance(value, Path) and "\0" in str(value):
         raise error(f"{label} is no name of a file: it holds a NUL")
     return value
+
+
+def _classes(kinds: tuple[Any, ...]) -> tuple[type, ...]:
+    """Return the classes of which a value must be; none where a kind is neither one of the package's nor a mapping."""
+    origins = [get_origin(kind) or kind for kind in kinds if kind is not NoneType]
+    is_ours = all(
+        kind in (Mapping, dict)
+        or (
+            isinstance(kind, type)
+            and kind.__module__.startswith("rgbmidic.")
+            and not getattr(kind, "_is_protocol", False)
+        )
+        for kind in origins
+    )
+    return tuple(origins) if is_ours else ()
 
 
 def _array(values: Any, label: str, error: type[RgbmidicError]) -> Any:

@@ -11,6 +11,7 @@ from typer import Option
 
 from rgbmidic import command
 from rgbmidic.errors import InputError, import_optional
+from rgbmidic.result_source import ResultSource, derived_options, result_options
 
 app = typer.Typer()
 
@@ -77,11 +78,11 @@ def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @app.command()
-@command.result_options
+@result_options
 @command.collect_options("probes", _PROBE_OPTIONS, _read_probes)
 @command.collect_options("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
-    source: command.ResultSource,
+    source: ResultSource,
     probes: dict[str, Any],
     channels: dict[str, Any],
     out: Annotated[Path | None, Option(help="CSV file to write; a picture gets its name. Else printed only.")] = None,
@@ -122,10 +123,10 @@ def history(
 
 
 @app.command()
-@command.result_options
-@command.derived_options
+@result_options
+@derived_options
 def profile(
-    source: command.ResultSource,
+    source: ResultSource,
     line: Annotated[str, Option(metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
     out: Annotated[Path, Option(help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
@@ -174,10 +175,10 @@ def profile(
 
 
 @app.command()
-@command.result_options
-@command.derived_options
+@result_options
+@derived_options
 def movie(
-    source: command.ResultSource,
+    source: ResultSource,
     out: Annotated[Path, Option(help="File to write: .mp4, .webm or .gif.")],
     derived: dict[str, Any],
     field: Annotated[str, Option(help="Fields side by side, such as u,exx,velocity.")] = "u",

@@ -114,7 +114,8 @@ def batch(
             outcomes.append(outcome)
             series.write_summary(outcomes, out / "summary.csv")
             write_batch_page(*series.summary_rows(outcomes), out / "summary.html")
-            note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
+            success = "measured" if outcome.measured else "measured before"
+            note(f"{outcome.name}: {command.name_options(outcome.reason) or success}")
     print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
     if failed := [outcome.name for outcome in outcomes if outcome.reason]:
         raise typer.Exit(command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}"))

@@ -10,15 +10,16 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic.errors import InputError, import_optional
+from rgbmidic.result_source import ResultSource, derived_options, result_options
 
 app = typer.Typer()
 
 
 @app.command()
-@command.result_options
-@command.derived_options
+@result_options
+@derived_options
 def figures(
-    source: command.ResultSource,
+    source: ResultSource,
     derived: dict[str, Any],
     out: Annotated[Path | None, Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
     frames: Annotated[str, Option(help="Such as 0,5,10:20; by default three frames.")] = "",
@@ -48,9 +49,9 @@ def figures(
 
 
 @app.command()
-@command.result_options
+@result_options
 def export(
-    source: command.ResultSource,
+    source: ResultSource,
     out: Annotated[Path, Option(help="File to write; for crackpy a folder.")],
     to: Annotated[str, Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
     overwrite: command.Overwrite = False,
@@ -62,9 +63,9 @@ def export(
 
 
 @app.command()
-@command.result_options
+@result_options
 def report(
-    source: command.ResultSource,
+    source: ResultSource,
     out: Annotated[Path | None, Option(help="HTML file; by default RESULT/report.html.")] = None,
     frames: Annotated[str, Option(help="Frames to show as maps, such as 0,5,10:20.")] = "",
     overwrite: command.Overwrite = False,
@@ -100,9 +101,9 @@ def view(
 
 
 @app.command()
-@command.result_options
+@result_options
 def compare(
-    source: command.ResultSource,
+    source: ResultSource,
     fe: Annotated[Path, Option(help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")],
     out: command.Out,
     mesh: Annotated[Path | None, Option(help="Mesh file with the nodes of a .csv.")] = None,

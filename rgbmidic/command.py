@@ -1,6 +1,6 @@
 """Parts of both commands: errors become one line and an exit status, several commands take the same options.
 
-And what those of `rgbmidic` share: the result that they read, notes, tables and progress.
+And how those of `rgbmidic` print notes, tables and progress.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import wraps
 from itertools import chain
 from pathlib import Path
@@ -31,8 +30,6 @@ from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError, disk_
 
 if TYPE_CHECKING:
     from rgbmidic.illumination.calibration import TargetLights
-    from rgbmidic.results import Maps, Result
-    from rgbmidic.settings import ScaleSettings, TestSettings
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
@@ -123,6 +120,7 @@ def main(app: typer.Typer) -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
     handler.addFilter(OnceFilter())
+    handler.setFormatter(OptionFormatter())
     loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
     for logger in loggers:  # not the root: other libraries talk to programmers
         logger.addHandler(handler)
@@ -130,6 +128,14 @@ def main(app: typer.Typer) -> None:
     for logger in loggers:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+class OptionFormatter(logging.Formatter):
+    """A formatter that reports the arguments that a message of the library names as options."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the text of a record."""
+        return name_options(super().format(record))
 
 
 class OnceFilter(logging.Filter):
@@ -176,8 +182,18 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
 
 def fail(message: str, status: int = FAILURE) -> int:
     """Print an error as one line and return the status."""
-    print(f"error: {shorten(' '.join(message.split()))}", file=sys.stderr)
+    print(f"error: {shorten(' '.join(name_options(message).split()))}", file=sys.stderr)
     return status
+
+
+_ARGUMENT = re.compile("`([a-z_]+)(=True)?`")
+_OPTIONS = {"point_pairs": "points", "points": "point", "scale": "test"}
+"""Options that have another name than the argument that they state."""
+
+
+def name_options(message: str) -> str:
+    """Replace the arguments of functions that a message of the library names, such as `overwrite=True`, by options."""
+    return _ARGUMENT.sub(lambda match: f"--{_OPTIONS.get(match[1], match[1]).replace('_', '-')}", message)
 
 
 def print_help_without_command(context: typer.Context) -> None:
@@ -331,70 +347,6 @@ def read_shape(text: str | None) -> tuple[int, int] | None:
     if not size:
         raise InputError(f"--shape is ROWSxCOLUMNS, such as 512x768, not {text!r}")
     return int(size[1]), int(size[2])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResultSource:
-    """A result that a command reads, and the settings that replace those stored in it, if any are stated."""
-
-    result: Result
-    settings: TestSettings | None
-
-    def scale(self, *, px: bool = False) -> ScaleSettings | None:
-        """Return the scale of these settings, with lengths in px if `px`; None: that of the result."""
-        from rgbmidic.settings import ScaleSettings
-
-        scale = None if self.settings is None else self.settings.scale
-        return replace(scale or self.result.section(ScaleSettings), unit="px") if px else scale
-
-    def maps(self, derived: Mapping[str, Any]) -> Maps:
-        """Return the fields of the result, derived as the options of `derived_options` state."""
-        from rgbmidic.results import Maps
-
-        choices = dict(derived)
-        return Maps.from_result(self.result, self.scale(px=choices.pop("px")), **choices)
-
-    def frames(self, text: str) -> list[int] | None:
-        """Return the measured frames among those that ``--frames`` states; None if it is empty."""
-        if (indices := read_frames(text)) is None:
-            return None
-        result, available = self.result, f"{self.result.path} has frames 0 to {len(self.result) - 1}"
-        if max(indices) >= len(result):
-            raise InputError(f"--frames {text}: {available}")
-        if not (measured_indices := [frame for frame in indices if result.finished[frame]]):
-            raise InputError(f"--frames {text}: none of them is measured; {available}")
-        return measured_indices
-
-
-def _open_result(options: Mapping[str, Any]) -> ResultSource:
-    from rgbmidic.results import Result
-    from rgbmidic.settings import read_test
-
-    result, test = Result.open(options["result"], partial=options["partial"]), options["test"]
-    return ResultSource(result=result, settings=None if test is None else read_test(test))
-
-
-_RESULT_OPTIONS: dict[str, Any] = {
-    "result": Annotated[Path, Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
-    "test": Annotated[
-        Path | None,
-        Option(help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."),
-    ],
-    "partial": Annotated[bool, Option("--partial", help="Use the finished frames of an interrupted run.")],
-}
-result_options = collect_options("source", _RESULT_OPTIONS, _open_result, result=REQUIRED, partial=False)
-"""Decorator of a command whose parameter `source` is the result that it reads."""
-
-_DERIVED: dict[str, Any] = {
-    "gauge": Annotated[float | None, Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
-    "measure": Measure,
-    "since": Annotated[int | None, Option(metavar="N", help="Show the fields relative to frame N.")],
-    "rigid_removed": Annotated[bool, Option("--remove-rigid", help="Remove the rigid motion.")],
-    "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more.")],
-    "px": Pixels,
-}
-derived_options = collect_options("derived", _DERIVED, dict, rigid_removed=False, px=False)
-"""Decorator of a command whose parameter `derived` states how fields are derived, see `rgbmidic.results.Maps`."""
 
 
 def note(text: str) -> None:

@@ -23,6 +23,11 @@ def format_value(value: float, std: float) -> str:
     -------
     str
         A dash for a value that is not finite.
+
+    Examples
+    --------
+    >>> format_value(0.14327, 0.0022)
+    '0.1433'
     """
     if not math.isfinite(value):
         return "-"
@@ -49,6 +54,11 @@ def format_with_std(value: float, std: float, unit: str = "") -> str:
     Returns
     -------
     str
+
+    Examples
+    --------
+    >>> format_with_std(0.14327, 0.0022, "mm")
+    '0.1433 ± 0.0022 mm'
     """
     if not math.isfinite(value):
         return "-"

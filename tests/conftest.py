@@ -11,12 +11,13 @@ from contextlib import ExitStack, nullcontext
 import pytest
 import real_files
 from draws import JITTER, SAMPLERS, other_draws
+from kernels_of_tests import compiled_in_background
 from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
 from rgbmidic import report
-from rgbmidic.lab.demo import compile_kernels_in_background
 
+_compilation = ExitStack()
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
@@ -32,18 +33,28 @@ def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
     if getattr(config.option, "numprocesses", None):
         os.environ |= {name: os.environ.get(name, "1") for name in THREADS}
-        with nullcontext() if config.option.collectonly else compile_kernels_in_background():
-            pass
+        if not config.option.collectonly:
+            _compilation.enter_context(compiled_in_background())
+            config.add_cleanup(_compilation.close)
+    else:
+        gc.disable()  # a third of the time of collecting tests is that of looking through what they are made of
     stack = ExitStack()
     stack.enter_context(kept_renders())
     stack.enter_context(other_draws(config.option.draw, config.option.sampler, config.option.jitter))
     config.add_cleanup(stack.close)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished() -> None:
+    """Wait for the kernels, which are compiled while the tests are collected: no two processes compile the same."""
+    _compilation.close()
+
+
 def pytest_collection_finish() -> None:
     """Let no collection of garbage look through what the tests are made of."""
-    gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 100)  # a twentieth of the time of the tests
+    gc.enable()
 
 
 RENDERER = ("lab/virtual", "scene", "kernels")

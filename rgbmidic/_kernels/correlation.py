@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rgbmidic._kernels.owned_pixels import LANES, correct_element, largest_element
 from rgbmidic._kernels.splines import PAD
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
@@ -24,8 +25,6 @@ BLOCK = 8
 """Side (px) of the blocks for each of which `warped_weights` knows whether all weights are 1: eight bytes, compared at
 once."""
 _NEVER = np.float32(1e9)
-_LANES = 8
-"""Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
 @helper(forceinline=True, fastmath=FAST)
@@ -133,7 +132,7 @@ def differences(
                 side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(remaining - 1))
                 n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
                 # whole vectors, of which the last one may be too long, where memory goes on so far
-                filled = (n + _LANES - 1) // _LANES * _LANES
+                filled = (n + LANES - 1) // LANES * LANES
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
@@ -251,14 +250,15 @@ def element_block_products(
 @compiled("elements", fastmath=FAST)
 def warped_weights(
     start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
-    elements, barycentric, displacement, weight, moments,
+    elements, barycentric, displacement, weight, moments, is_changed,
 ):  # fmt: skip
     """Warp the weights of one light to the owned pixels, and sum the grey levels of both states with them.
 
     `weight` (P,) float32 receives the `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced
     position (bilinear), 0 outside and beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other
     than 1: how many such blocks of `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f,
-    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,).
+    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,). `is_changed` (E,) says
+    where the weight may be another than that of the reference.
     """
     height, width = deformed_weight.shape
     for e in range(start, stop):
@@ -268,7 +268,7 @@ def warped_weights(
         left_x = top_y = np.float32(np.inf)
         right_x = bottom_y = -np.float32(np.inf)
         if run_offsets[e] == run_offsets[e + 1]:
-            moments[e] = 0.0
+            moments[e], is_changed[e] = 0.0, False
             continue
         begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
         for run in range(run_offsets[e], run_offsets[e + 1]):
@@ -279,7 +279,9 @@ def warped_weights(
                 left_x, right_x = min(left_x, px), max(right_x, px)
                 top_y, bottom_y = min(top_y, py), max(bottom_y, py)
         inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
-        if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
+        sides = base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y
+        is_changed[e] = not inside or _any_partial(partial, *sides)
+        if not is_changed[e]:
             for i in range(np.uint64(begin), np.uint64(end)):
                 weight[i] = reference_weight[i]
         else:
@@ -368,20 +370,41 @@ def element_vector(start, stop, weight, values, first, second, local_x, local_y,
     (P,) float32.
     """
     for e in range(start, stop):
-        b00, b01, b02 = _shape_function(barycentric, e, 0)
-        b10, b11, b12 = _shape_function(barycentric, e, 1)
-        p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
-            l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
-            weighted = weight[i] * values[i]
-            p, q = weighted * first[i], weighted * second[i]
-            p0 += p * l0
-            p1 += p * l1
-            p2 += p
-            q0 += q * l0
-            q1 += q * l1
-            q2 += q
-        out[e, 0, 0], out[e, 0, 1] = p0, q0
-        out[e, 1, 0], out[e, 1, 1] = p1, q1
-        out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1
+        _project(weight, values[offsets[e] :], first, second, local_x, local_y, offsets, barycentric, e, out)
+
+
+@compiled("out", fastmath=FAST)
+def corrected_vector(
+    start, stop, weight, difference, first, second, reference, inverse_level, scales, side, offset, lines, run_offsets,
+    local_x, local_y, offsets, barycentric, out,
+):  # fmt: skip
+    """Do the same with a `difference` that is corrected as by `correct_brightness`, and stays as it is."""
+    values = np.empty(largest_element(offsets) + LANES, dtype=np.float32)
+    brightness = reference, inverse_level, scales, side, offset
+    for e in range(start, stop):
+        correct_element(difference, *brightness, lines, run_offsets, offsets, e, values)
+        _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out)
+
+
+@helper(fastmath=FAST)
+def _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out):
+    """Project on the shape functions of element e, whose `values` these are."""
+    b00, b01, b02 = _shape_function(barycentric, e, 0)
+    b10, b11, b12 = _shape_function(barycentric, e, 1)
+    p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
+    begin = np.uint64(offsets[e])
+    for n in range(np.uint64(offsets[e + 1]) - begin):
+        i = begin + n
+        l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
+        l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
+        weighted = weight[i] * values[n]
+        p, q = weighted * first[i], weighted * second[i]
+        p0 += p * l0
+        p1 += p * l1
+        p2 += p
+        q0 += q * l0
+        q1 += q * l1
+        q2 += q
+    out[e, 0, 0], out[e, 0, 1] = p0, q0
+    out[e, 1, 0], out[e, 1, 1] = p1, q1
+    out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1

@@ -16,7 +16,7 @@ from rgbmidic._kernels.threads import FAST, compiled, helper
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
-_LANES = 8
+LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
@@ -108,41 +108,78 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
 def block_sums(start, stop, values, lines, run_offsets, side, out):
     """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
     out[:, start:stop] = 0
-    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
+    columns = np.zeros((len(values), out.shape[2] * side + LANES), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         _add(values, np.uint64(0), lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
 @compiled("out", axis=1, fastmath=FAST)
-def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets, side, out):
-    """Sum fields (n, P) times one `weight` (P,) over blocks of `side` px: ``out`` (n, h, w)."""
+def weighted_block_sums(start, stop, values, weight, lines, run_offsets, side, out):
+    """Sum a field (P,) times a `weight` (P,), and the weight, over blocks of `side` px: ``out`` (2, h, w).
+
+    One of (1, h, w) receives the first sum only.
+    """
     out[:, start:stop] = 0
-    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
-    products = np.empty((len(values), _largest(offsets)), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
     for e in range(run_offsets.size - 1):
-        first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        for n in range(len(values)):
-            for i in range(number):
-                products[n, i] = weight[first + i] * values[n, first + i]
-        _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+        block, low, high = np.int64(-1), np.int64(0), np.int64(0)
+        for q in range(run_offsets[e], run_offsets[e + 1]):
+            slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
+            if row < start * side or row >= stop * side:
+                continue
+            if row // side != block:
+                _flush(columns, low, high, side, block, out)
+                block, low, high = row // side, column, column
+            low, high = min(low, column), max(high, column + number)
+            at, to, filled = np.uint64(slot), np.uint64(column), np.uint32(_filled(number, values.size - slot))
+            for i in range(filled):
+                product = weight[at + i] * values[at + i]
+                columns[0, to + i] += product if np.int32(i) < np.int32(number) else _ZERO
+            if len(out) > 1:
+                for i in range(filled):
+                    columns[1, to + i] += weight[at + i] if np.int32(i) < np.int32(number) else _ZERO
+        _flush(columns, low, high, side, block, out)
 
 
-@compiled("lines", fastmath=FAST)
-def correct_brightness(start, stop, lines, reference, inverse_level, scales, border, offset, difference):
+@compiled("offsets", fastmath=FAST)
+def correct_brightness(
+    start, stop, reference, inverse_level, scales, side, offset, lines, run_offsets, offsets, difference,
+):  # fmt: skip
     """Correct the `difference` f - g of one light: it becomes ``(f - scale (g - b)) inverse_level``.
 
-    The scale is that of the image `scales` (H, W) over the rectangle around the pixels and a `border` of so many px.
-    The `offset` b has a constant and slopes along columns and rows; the other fields are (P,) float32.
+    The rows of `scales` (h, W) belong to the centres of rows of blocks of `side` px, the first one of which lies above
+    the rectangle around the pixels, as the first `side` columns lie before it. The `offset` b has a constant and slopes
+    along columns and rows; the other fields are (P,) float32.
     """
-    for q in range(start, stop):
-        first, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-        row, column = np.uint64(lines[q, 2]), np.uint64(lines[q, 3])
-        at, from_column = row + np.uint64(border), column + np.uint64(border)
-        b, slope = np.float32(offset[0] + offset[2] * row + offset[1] * column), np.float32(offset[1])
-        for i in range(number):
-            f = reference[first + i]
+    corrected = np.empty(largest_element(offsets) + LANES, dtype=np.float32)
+    brightness = reference, inverse_level, scales, side, offset
+    for e in range(start, min(stop, offsets.size - 1)):
+        correct_element(difference, *brightness, lines, run_offsets, offsets, e, corrected)
+        first = np.uint64(offsets[e])
+        for i in range(np.uint64(offsets[e + 1]) - first):
+            difference[first + i] = corrected[i]
+
+
+@helper(fastmath=FAST)
+def correct_element(
+    difference, reference, inverse_level, scales, side, offset, lines, run_offsets, offsets, e, out,
+):  # fmt: skip
+    """Write the corrected difference of an element into ``out``, which is longer by a vector."""
+    constant, slope, down = np.float32(offset[0]), np.float32(offset[1]), np.float32(offset[2])
+    pace = _ONE / np.float32(side)
+    for q in range(run_offsets[e], run_offsets[e + 1]):
+        slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], lines[q, 3] + side
+        first, target, from_column = np.uint64(slot), np.uint64(slot - offsets[e]), np.uint64(column)
+        position = (np.float32(row) + _HALF) * pace + _HALF
+        above = np.uint32(position)
+        fraction, below = position - np.float32(above), above + np.uint32(1)
+        b = constant + down * np.float32(row) + slope * np.float32(column - side)
+        filled = _filled(number, min(reference.size - slot, scales.shape[1] - column))
+        for i in range(np.uint32(filled)):  # the next row overwrites what is too long
+            f, scale = reference[first + i], scales[above, from_column + i]
+            scale += fraction * (scales[below, from_column + i] - scale)
             g = f - difference[first + i] - (b + slope * np.float32(np.int32(i)))
-            difference[first + i] = (f - scales[at, from_column + i] * g) * inverse_level[first + i]
+            out[target + i] = (f - scale * g) * inverse_level[first + i]
 
 
 @compiled("out", axis=1, fastmath=FAST)
@@ -152,8 +189,8 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
     ``out`` (k (k + 1), h, w) receives both sums, with the fields' `weights` (k, P), for each field with those up to it.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
-    largest = _largest(offsets)
+    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
+    largest = largest_element(offsets)
     field, root = np.empty((2, len(values), largest), dtype=np.float32)
     products = np.empty((len(out), largest), dtype=np.float32)
     for e in range(run_offsets.size - 1):
@@ -182,9 +219,11 @@ def score_sums(
     the `corrected` ones without the residual.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
-    scores, states = np.empty((2, 6, _largest(offsets)), dtype=np.float32)
-    inside, one = np.empty(_largest(offsets), dtype=np.float32), np.uint64(1)
+    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
+    size = largest_element(offsets) + LANES
+    # an array of its own: of a slice the compiler does not know that it is contiguous
+    scores, states = np.empty((len(out), size), dtype=np.float32), np.empty((4, size), dtype=np.float32)
+    inside, one = np.empty(largest_element(offsets), dtype=np.float32), np.uint64(1)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
         scores[:] = 0
@@ -223,11 +262,11 @@ def score_sums(
                     mean = states[1, a + i] + states[1, b + i]
                     scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
                     scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
-        _add(scores[: len(out)], first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
 @helper()
-def _largest(offsets):
+def largest_element(offsets):
     """Number of pixels of the largest element."""
     largest = 0
     for e in range(offsets.size - 1):
@@ -261,15 +300,19 @@ def _add(fields, begin, lines, run_offsets, e, top, bottom, side, columns, out):
             block, low, high = row // side, column, column
         low, high = min(low, column), max(high, column + number)
         at, to = np.uint64(slot) - begin, np.uint64(column)
-        # whole vectors, of which the last one may be too long, where memory goes on so far
-        filled = (number + _LANES - 1) // _LANES * _LANES
-        if np.int64(at) + filled > fields.shape[1]:
-            filled = number
+        filled = _filled(number, fields.shape[1] - np.int64(at))
         for n in range(len(fields)):
             for i in range(np.uint32(filled)):
                 value = fields[n, at + i]
                 columns[n, to + i] += value if np.int32(i) < np.int32(number) else _ZERO
     _flush(columns, low, high, side, block, out)
+
+
+@helper(forceinline=True)
+def _filled(number, room):
+    """Pixels of the whole vectors that hold a `number` of them; no more than these where memory has no `room`."""
+    filled = (number + LANES - 1) // LANES * LANES
+    return filled if filled <= room else number
 
 
 @helper(fastmath=FAST)

@@ -22,6 +22,10 @@ At a lower price rates are noisier at rest, at a higher one the jerk that begins
 _OLD, _FAINT, _ROOM = 3, 6.0, 16
 """A piece's start is followed for so many windows, whatever its odds (a weak kink takes two to show), and longer if its
 log odds are above `-_FAINT`, 1 in 400, and it is among the so many first of those."""
+_CORRELATION = 0.7
+"""Correlation from frame to frame of what a variance exceeds those around it by, as while a reflection passes: .69 of
+the strain in travelling glare (benchmarks/hole_trial.py); .58 to .72 makes a slope over 7 to 11 frames least certain
+(derived)."""
 _NONE = np.int64(-1)
 """No index; a literal would compile what it is given to once more."""
 _NEVER = 12.0
@@ -157,15 +161,31 @@ def _at(x, top, norms, shifts, out):
 
 
 @helper()
+def _rate_of_onset(y, w, neighbour, interval, line, z, degree):
+    """Rate at an end of a piece by a motion that sets in before it and shows in the neighbouring value first.
+
+    What departs from the piece by a standard uncertainty s at its end is not seen. If it grows by a power of the time
+    since the interval before, and is E at the neighbour, the power is log2(E / s), and its rate s times that power over
+    the interval. E / s is taken as 1 + the excess of the departure from the tangent (`line`) over its noise.
+    """
+    tangent, variance = 0.0, 1 / w[neighbour] ** 2
+    for k in range(degree + 1):
+        tangent += line[k] * z[k]
+        variance += line[k] ** 2
+    excess = (y[neighbour] - tangent) ** 2 / variance - 1
+    return np.log2(1 + np.sqrt(excess)) / (w[neighbour] * interval) if excess > 0 else 0.0
+
+
+@helper()
 def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base, work, sums, lines):
     """Add the fits of a window of known frames, of a probability for each degree, to the frames `low` to `high`.
 
     A fit counts by its probability over the standard uncertainty of its velocity: over the variance, what is false at
-    an onset was up to 8 times the stated. `sums` (3, T, 3, 4) receives, for frames where the piece goes on to both
-    sides, begins (`begin`) or ends (`end`), and for each derivative, the sums of weights, estimates, their squares and
-    variances; `lines` (T, 3, width) the weights of the values in the estimates.
+    an onset was up to 8 times the stated. `sums` (3, T, 3, 5) receives, for frames where the piece goes on to both
+    sides, begins (`begin`) or ends (`end`), and for each derivative, the sums of weights, estimates, their squares,
+    variances, and squares of `_rate_of_onset`; `lines` (T, 3, width) the weights of the values in the estimates.
     """
-    norms, shifts, values, at, z, mixed = work
+    norms, shifts, values, at, z, mixed, line = work
     top = _NONE
     for d in range(LOWEST, HIGHEST + 1):
         if chance[d - LOWEST] > _MIN_PROBABILITY and last - first >= d:
@@ -190,6 +210,13 @@ def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base
             for k in range(d + 1):
                 spread += at[1, k] ** 2
             weight = chance[d - LOWEST] / np.sqrt(spread)
+            for is_at_end, neighbour in ((i == begin, first - 1), (i == end, last + 1)):
+                if is_at_end and 0 <= neighbour < t.size:
+                    interval = t[neighbour] - times[i]
+                    for k in range(d + 1):
+                        line[k] = at[0, k] + interval * at[1, k]
+                    rate = _rate_of_onset(y, w, neighbour, interval, line, z, d)
+                    sums[group, i, 1, 4] += weight * rate**2
             for o in range(3):
                 estimate = variance = 0.0
                 for k in range(d + 1):
@@ -267,23 +294,41 @@ def _average(t, y, w, frames, times, count, starts, ends, chances, base, work, s
 
 
 @helper()
-def _conclude(w, frames, reference, base, sums, lines, out):
+def _excess_std(t, w, out):
+    """Root of what the variance of each value exceeds twice the least within a window to both sides by.
+
+    Less is how variances differ from frame to frame without a reflection.
+    """
+    for j in range(t.size):
+        out[j] = 0.0
+        for k in range(np.searchsorted(t, t[j] - 1), np.searchsorted(t, t[j] + 1, side="right")):
+            out[j] = max(out[j], 1 / w[j] ** 2 - 2 / w[k] ** 2)
+        out[j] = np.sqrt(out[j])
+
+
+@helper()
+def _conclude(w, excess, frames, reference, base, sums, lines, out):
     """Means and their variances (2, 7, T) from what `_add_window` added up.
 
-    The variance of the mean in noise, and the spread of what it is taken over; for one side, where `lines` does not
-    give the former, the mean of the variances. Of the value, the part that the reference adds to all is left out.
+    The variance of the mean in noise, of which `excess` (n,) is correlated from frame to frame, the spread of what it
+    is taken over, and what an onset hides next to the ends of pieces; for one side, where `lines` does not give the
+    first, the mean of the variances. Of the value, the part that the reference adds to all is left out.
     """
     for i in range(base.size):
         for o in range(3):
             weight = sums[:, i, o, 0].sum()
             if weight == 0:
                 continue
-            mean, chance = sums[:, i, o, 1].sum() / weight, 0.0
+            mean, chance, passing, last = sums[:, i, o, 1].sum() / weight, 0.0, 0.0, base[i]
             for j in range(base[i], min(base[i] + lines.shape[2], frames.size)):
                 line = lines[i, o, j - base[i]] / weight
                 chance += (line**2 - (2 * line * reference[frames[j]] if o == 0 else 0.0)) / w[j] ** 2
+                passing *= _CORRELATION ** (frames[j] - frames[last])
+                chance += 2 * line * excess[j] * passing
+                passing, last = passing + line * excess[j], j
             spread = max(sums[:, i, o, 2].sum() / weight - mean**2, 0.0)
-            out[0, o, i], out[1, o, i] = mean, chance + spread
+            onset = sums[:, i, o, 4].sum() / weight
+            out[0, o, i], out[1, o, i] = mean, chance + spread + onset
             for side in range(2 if o else 0):
                 totals = sums[0, i, o] + sums[2 - side, i, o]
                 if totals[0] > 0:
@@ -310,9 +355,17 @@ def mean_rates(start, stop, times, values, noise, common, reference, max_frames,
     room = size * (young + _ROOM + 1)
     starts, ends = np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64)
     logs, before = np.zeros((room, HIGHEST - LOWEST + 1)), np.zeros(size + 1)
-    sums, lines = np.zeros((3, size, 3, 4)), np.zeros((size, 3, width))
+    sums, lines, excess = np.zeros((3, size, 3, 5)), np.zeros((size, 3, width)), np.zeros(size)
     top = HIGHEST + 1
-    work = (np.zeros(top), np.zeros(top), np.zeros((top, size)), np.zeros((3, top)), np.zeros(top), np.zeros((3, top)))
+    work = (
+        np.zeros(top),
+        np.zeros(top),
+        np.zeros((top, size)),
+        np.zeros((3, top)),
+        np.zeros(top),
+        np.zeros((3, top)),
+        np.zeros(top),
+    )
     for column in range(start, stop):
         n, origin = np.int64(0), 0.0
         for i in range(size):
@@ -328,7 +381,8 @@ def mean_rates(start, stop, times, values, noise, common, reference, max_frames,
         _probabilities(n, count, starts, ends, logs, before)
         sums[:], lines[:] = 0.0, 0.0
         _average(t[:n], y[:n], w[:n], frames, times, count, starts, ends, logs, base, work, sums, lines)
-        _conclude(w[:n], frames[:n], reference, base, sums, lines, out[column])
+        _excess_std(t[:n], w[:n], excess)
+        _conclude(w[:n], excess, frames[:n], reference, base, sums, lines, out[column])
         for i in range(size):
             out[column, 0, 0, i] += origin
             out[column, 1, 0, i] += common[column, i]

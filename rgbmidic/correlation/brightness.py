@@ -18,7 +18,7 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import SlidingWindow, centred_products, window_sums
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+from rgbmidic.typing import FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
@@ -64,8 +64,7 @@ class GainFit:
     def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
         """Prepare the gain over `values` (P,) with `weights` (P,)."""
         side = _block_side(sigma)
-        (sums,) = pixels.weighted_block_sums(values[None], weights, side)
-        (totals,) = pixels.block_sums(weights[None], side)
+        sums, totals = pixels.weighted_block_sums(values, weights, side, with_weight=True)
         total, x, y, xx, xy, yy = _moments(sums, sigma / side, 2)
         # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With
         # a tenth a slope of the light is followed too little at edges: coarse speckle errs there by twice as much
@@ -83,8 +82,7 @@ class GainFit:
 
     def block_sums(self, field: FloatImage) -> FloatArray:
         """Sum a field (P,) with the weights over the blocks, (h, w)."""
-        (sums,) = self.pixels.weighted_block_sums(field[None], self.weights, self.side)
-        return np.asarray(sums)
+        return np.asarray(self.pixels.weighted_block_sums(field, self.weights, self.side)[0])
 
     def gain(self, sums: FloatArray) -> FloatImage:
         """Return the gain (h, w) at the blocks of a field with such `sums`."""
@@ -106,22 +104,14 @@ def local_gain_fits(
 
 
 def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
-    """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) of blocks in a window of `sigma` blocks."""
-    rows, columns = np.arange(len(sums), dtype=np.float64)[:, None], np.arange(sums.shape[1], dtype=np.float64)
-
-    def windowed(grid: FloatArray) -> AnyArray:
-        return cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-
-    total, x, y = windowed(sums), windowed(sums * columns), windowed(sums * rows)
-    moments = [total, x - columns * total, y - rows * total]
-    if order == 2:
-        xx, xy, yy = (windowed(sums * product) for product in (columns * columns, columns * rows, rows * rows))
-        moments += [
-            xx - columns * (2 * x - columns * total),
-            xy - columns * y - rows * (x - columns * total),
-            yy - rows * (2 * y - rows * total),
-        ]
-    return np.stack(moments)
+    """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) about blocks in a window of `sigma` blocks."""
+    reach = int(np.ceil(4 * sigma))
+    window, arm = cv2.getGaussianKernel(2 * reach + 1, sigma), np.arange(-reach, reach + 1.0)[:, None]
+    kernels = window, arm * window, arm * arm * window
+    powers = [(x, total - x) for total in range(order + 1) for x in range(total, -1, -1)]
+    return np.stack(
+        [cv2.sepFilter2D(sums, -1, kernels[x], kernels[y], borderType=cv2.BORDER_CONSTANT) for x, y in powers]
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,34 +135,35 @@ class Brightness:
     def inverse_gain(
         self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float
     ) -> tuple[FloatImage, int]:
-        """Return 1 / a of a light from its difference f - g (P,), and the width of the border around it.
+        """Return 1 / a of a light from its difference f - g (P,), for `correct_brightness`, and the side of its blocks.
 
-        It is that of the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so
-        that a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
+        It covers the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so that
+        a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
         """
         fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
         if fit is None:
-            return np.full(shape, 1 / gain, dtype=np.float32), 0
-        rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
-        x, y = (columns + 0.5) * fit.side - 0.5, (rows + 0.5) * fit.side - 0.5
-        plane = offset[0] + offset[1] * x + offset[2] * y
-        local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
-        grid, largest = 1 / np.maximum(local, np.float32(min_ratio * gain)), 1 / (min_ratio * gain)
+            side, grid = max(shape), np.full((1, 1), 1 / gain)
+        else:
+            side = fit.side
+            rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
+            x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
+            plane = offset[0] + offset[1] * x + offset[2] * y
+            local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
+            grid = 1 / np.maximum(local, np.float32(min_ratio * gain))
         if min(grid.shape) > 1:  # linear beyond the centres of the outermost blocks, too
-            grid = np.clip(np.pad(grid, 1, mode="reflect", reflect_type="odd"), 0, largest, dtype=np.float32)
+            grid = np.pad(grid, 1, mode="reflect", reflect_type="odd")
+            grid = np.clip(grid, 0, 1 / (min_ratio * gain), dtype=np.float32)
         else:
             grid = np.pad(grid, 1, mode="edge")
-        size = grid.shape[1] * fit.side, grid.shape[0] * fit.side
-        return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)), fit.side
+        size = grid.shape[1] * side, grid.shape[0]
+        return np.asarray(cv2.resize(grid.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)), side
 
 
-_ELEMENTS = 300
+ELEMENTS = 300
 """Elements from which a light's gain and offset are found: their medians are known to 7 % of the scatter (derived)."""
 
 
-def gain_and_offset(
-    moments: FloatArray, centres: FloatArray, constants: SolverConstants
-) -> tuple[FloatArray, FloatArray]:
+def gain_and_offset(moments: FloatArray, centres: FloatArray, min_correlation: float) -> tuple[FloatArray, FloatArray]:
     """Find the gain (k,) and the offset (k, 3) of each light, from elements that show the same texture in both states.
 
     The gain is the ratio of the standard deviations, which noise that is alike in both states changes little. It is NaN
@@ -185,17 +176,17 @@ def gain_and_offset(
         Sums of w, w f, w g, w f f, w f g, w g g over elements.
     centres : ndarray, shape (E, 2)
         Column and row of the elements.
-    constants
-        Of the solve.
+    min_correlation
+        Correlation coefficient of both states from which an element counts; -1: all with a texture do.
     """
     gains, offsets = np.full(len(moments), np.nan), np.zeros((len(moments), 3))
     for light, sums in enumerate(moments):
         (total, f, g, *_), (fg, ff, gg) = sums.T, centred_products(sums)
         total = np.maximum(total, 1e-30)
-        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(ff * gg))
+        is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(ff * gg))
         offsets[light, 0] = (g.sum() - f.sum()) / total.sum()
         if is_correlated.sum() > 0.1 * (ff > 0).sum():
-            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // _ELEMENTS]
+            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // ELEMENTS]
             gain = np.sqrt(gg[sample] / ff[sample])
             gains[light] = np.median(gain)
             offsets[light] = _offset_plane(centres[sample], (g[sample] - gain * f[sample]) / total[sample])

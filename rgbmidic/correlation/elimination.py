@@ -40,7 +40,7 @@ class Elimination:
         Rows of the lower half of the matrix: where each starts, nodes, and places (n, 2, 2) in the matrix' data.
     lower : csc_matrix, shape (N, N)
         Blocks of the lower factor under its diagonal.
-    before : csr_matrix, shape (N, N)
+    lower_by_rows : csr_matrix, shape (N, N)
         The same by rows.
     """
 
@@ -48,7 +48,7 @@ class Elimination:
     diagonal_slots: Index
     matrix_rows: tuple[Index, Index, Index]
     lower: sp.csc_matrix
-    before: sp.csr_matrix
+    lower_by_rows: sp.csr_matrix
 
     @classmethod
     def of_pairs(cls, row: Index, column: Index, slots: Index) -> Elimination:
@@ -85,7 +85,7 @@ class Elimination:
             diagonal_slots=diagonal_slots,
             matrix_rows=matrix_rows,
             lower=lower,
-            before=sp.csr_matrix(lower),
+            lower_by_rows=sp.csr_matrix(lower),
         )
 
     def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -103,7 +103,9 @@ class Elimination:
         """
         lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.order.size, 3))
         structure = self.lower.indptr, self.lower.indices
-        factorise(data, *self.matrix_rows, self.before.indptr, self.before.indices, *structure, lower, inverse)
+        factorise(
+            data, *self.matrix_rows, self.lower_by_rows.indptr, self.lower_by_rows.indices, *structure, lower, inverse
+        )
         xx, xy, yy = inverse.T
         growth = (xx + yy) * data[self.diagonal_slots].sum(axis=1)
         if not ((xx > 0) & (xx * yy > xy * xy) & (growth < _SINGULAR)).all():

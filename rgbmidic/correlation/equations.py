@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import differences
+from rgbmidic._kernels.correlation import corrected_vector, differences
 from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.constants import SolverConstants
@@ -379,14 +379,17 @@ def _right_sides(
     held = equations.held_side(reference, estimate.displacement)
     total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
+        weight, gradient = equations.weights[light], reference.gradient[:, light]
         if estimate_difference is not None:
-            difference = estimate_difference[light]
+            projected = reference.projected(weight, estimate_difference[light], gradient)
         else:
             warp_arguments = reference.warp(problem.deformed, light, displacement)
             differences(problem.deformed.coefficients[light], reference.values[light], *warp_arguments, difference)
-            reference.correct_brightness(brightness, light, difference)
-        gradient = reference.gradient[:, light]
-        vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
+            fields = reference.brightness_fields(brightness, light, difference)
+            pixels, projected = reference.pixels, np.empty((len(reference.mesh.elements), 3, 2))
+            lines = pixels.lines, pixels.run_offsets
+            corrected_vector(weight, difference, *gradient, *fields, *lines, *pixels.positions, projected)
+        vector = assembly.vector(projected)
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)

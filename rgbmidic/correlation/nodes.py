@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import element_hessian
-from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.images import centred_products
+from rgbmidic.correlation.reference import torn_elements
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
@@ -142,24 +142,6 @@ def matching_elements(
         typical = np.median(coefficient[textured][nearest], axis=1)
     matched[between] = coefficient[between] >= 1 - constants.outlier_factor * (1 - typical)
     return matched & intact
-
-
-def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
-    """Find the elements (E,) whose nodes have gone with different bodies, as a displacement (N, 2) has it.
-
-    Their stretch C, the right Cauchy-Green tensor, differs from the median of the elements around.
-    """
-    deformation = np.eye(2) + mesh.element_gradient(displacement)
-    stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
-    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.max_relative_stretch)
-    if torn.any():
-        centre = mesh.centres
-        neighbours = cKDTree(centre).query(
-            centre[torn], k=[*range(1, min(constants.neighbour_count, len(centre)) + 1)]
-        )[1]
-        excess = stretch[torn] - np.median(stretch[neighbours], axis=1)
-        torn[torn] = np.linalg.norm(excess, axis=(1, 2)) > constants.max_relative_stretch
-    return torn
 
 
 def correlation_around(residual: Residual) -> FloatArray:

@@ -265,6 +265,16 @@ def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
     Returns
     -------
     Solution
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=20)
+    >>> complete = with_one_sided_error(Tri3Mesh(nodes=solution.nodes, elements=solution.elements), solution)
+    >>> (complete.displacement_std >= solution.displacement_std)[solution.measured].all()
+    np.True_
     """
     active = np.asarray(solution.measured[mesh.elements].all(axis=1))
     error = one_sided_error(mesh, active, solution.displacement, solution.displacement_std)
@@ -290,6 +300,16 @@ def unresolved_strain(mesh: Tri3Mesh, solution: Solution, with_error: Solution) 
     -------
     str
         The error is rounded to 1, 2 or 5 of its decade, so that the frames of a test have few texts.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=20)
+    >>> mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
+    >>> unresolved_strain(mesh, solution, with_one_sided_error(mesh, solution))
+    ''
     """
     before, noise = (np.column_stack([result.displacement_std, result.strain_std]) for result in (solution, with_error))
     missed = np.column_stack([with_error.displacement_error, with_error.strain_error])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import (
     BLOCK,
@@ -17,7 +18,7 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import add_second_derivatives, correct_brightness, interpolate_nodal
+from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
@@ -63,6 +64,11 @@ class Deformed:
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     origin : tuple of int
         Column and row of the frame at which the images begin.
+
+    Examples
+    --------
+    >>> Deformed.prepare(np.ones((3, 40, 60), dtype=np.float32)).weights.shape
+    (3, 40, 60)
     """
 
     coefficients: FloatImage
@@ -190,6 +196,15 @@ class Reference:
         One of `PREFILTERS`.
     constants : SolverConstants
         Of the solve.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> reference.pixels.shape
+    (40, 60)
     """
 
     mesh: Tri3Mesh
@@ -288,7 +303,6 @@ class Reference:
         if brightness == "auto":
             sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
-        weighted *= level > DARK * level.max(axis=1, keepdims=True)
         inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
         for light, fit in enumerate(fits):
             for axis in light_gradient[:, light]:
@@ -319,7 +333,7 @@ class Reference:
             constants=constants,
         )
 
-    def brightness_of(self, weights: FloatImage, moments: FloatArray) -> Brightness:
+    def brightness_of(self, weights: FloatImage, moments: FloatArray, is_changed: BoolArray) -> Brightness:
         """Estimate gain and offset of deformed images.
 
         Parameters
@@ -328,6 +342,8 @@ class Reference:
             Weights of the pixels that both states show.
         moments : ndarray, shape (k, E, 6)
             As of `Residual`.
+        is_changed : ndarray, shape (k,), bool
+            Lights whose weights are not the `pixel_weights`: where pixels are saturated, or off the frame.
 
         Returns
         -------
@@ -335,19 +351,21 @@ class Reference:
         """
         gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
         if self.brightness != "none":
-            gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+            centres = self.mesh.centres - self.pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, self.constants.min_gain_correlation)
         has_gain = np.isfinite(gain)
         fits: list[GainFit | None] = [None] * len(weights)
         for light, fit in enumerate(self.gain_fits):
             if has_gain[light]:
-                f, w = self.values[light], weights[light]
-                # other weights where pixels are saturated, or off the frame
-                same = np.array_equal(w, fit.weights)
-                fits[light] = fit if same else GainFit.over(f, w, self.pixels, fit.sigma)
+                fits[light] = fit
+                if is_changed[light]:
+                    fits[light] = GainFit.over(self.values[light], weights[light], self.pixels, fit.sigma)
         return Brightness(gain=np.where(has_gain, gain, 1.0), offset=offset, fits=tuple(fits))
 
-    def correct_brightness(self, brightness: Brightness, light: int, difference: FloatImage) -> None:
-        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
+    def brightness_fields(
+        self, brightness: Brightness, light: int, difference: FloatImage
+    ) -> tuple[AnyArray | int, ...]:
+        """Return what makes a light's residual ``(f - (g - b) / a) / level`` of its difference f - g, for kernels.
 
         Parameters
         ----------
@@ -356,12 +374,16 @@ class Reference:
         light
             Index of the light.
         difference : ndarray, shape (P,), float32
-            Of the grey levels; becomes the residual.
+            Of the grey levels.
+
+        Returns
+        -------
+        tuple
+            See `rgbmidic._kernels.owned_pixels.correct_brightness`.
         """
         _, _, *shape = self.pixels.bounds
-        scales, border = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
-        fields = self.values[light], self.inverse_level[light], scales, border, brightness.offset[light]
-        correct_brightness(self.pixels.lines, *fields, difference)
+        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
+        return self.values[light], self.inverse_level[light], *scales, brightness.offset[light]
 
     @property
     def gain_window(self) -> float | None:
@@ -408,6 +430,7 @@ class Reference:
         inverse = np.stack([xy**2 + yy**2, -(xx * xy + yx * yy), xx**2 + yx**2], axis=1)
         inverse /= np.maximum((xx * yy - xy * yx) ** 2, 1e-9)[:, None]
         stretch_change = np.clip(inverse - (1, 0, 1), -1, self.constants.max_stretch_change)
+        stretch_change[torn_elements(self.mesh, displacement, self.constants)] = 0  # that is no strain
         if np.sqrt((stretch_change**2).mean()) < self.constants.min_stretch_change:
             return self
         factors = filter_variance(self.prefilter) / 2 * (stretch_change * (1, 2, 1)).astype(np.float32)
@@ -531,6 +554,24 @@ class Reference:
         return out
 
 
+def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
+    """Find the elements (E,) whose nodes have gone with different bodies, as a displacement (N, 2) has it.
+
+    Their stretch C, the right Cauchy-Green tensor, differs from the median of the elements around.
+    """
+    deformation = np.eye(2) + mesh.element_gradient(displacement)
+    stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
+    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.max_relative_stretch)
+    if torn.any():
+        centre = mesh.centres
+        neighbours = cKDTree(centre).query(
+            centre[torn], k=[*range(1, min(constants.neighbour_count, len(centre)) + 1)]
+        )[1]
+        excess = stretch[torn] - np.median(stretch[neighbours], axis=1)
+        torn[torn] = np.linalg.norm(excess, axis=(1, 2)) > constants.max_relative_stretch
+    return torn
+
+
 def warp_arguments(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:
     """Runs of pixels, elements, shape functions and a motion (N, 2) of the nodes, for the kernels that follow it."""
     return pixels.runs, pixels.run_offsets, pixels.origin, mesh.elements, pixels.barycentric, motion
@@ -563,11 +604,12 @@ def _sample_registered_lights(
         np.empty((2, *leading_shape, inside.size), dtype=np.float32) for leading_shape in (values.shape[:1], ())
     )
     zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
+    is_changed = np.empty(len(mesh.elements), dtype=bool)
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         warp, spline = warp_arguments(mesh, pixels, motion), state.coefficients[light]
         differences(spline, zero, *warp, values[light])
         images = state.weights[light], state.nonuniform_weight_blocks[light], zero, values[light], inside
-        warped_weights(*images, *warp, weights[light], moments)
+        warped_weights(*images, *warp, weights[light], moments, is_changed)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
         sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient

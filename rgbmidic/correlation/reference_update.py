@@ -45,6 +45,15 @@ class ReferenceUpdate:
         are; None before any update.
     uv_correlation : ndarray, shape (N,)
         Correlation of the errors of u and v of frame r, that of the texture around each node.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> ReferenceUpdate.none(reference).reference is reference
+    True
     """
 
     first: Reference

@@ -16,13 +16,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.owned_pixels import subtract_quadratic
-from rgbmidic.correlation.brightness import Brightness
+from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
+from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import FloatArray, FloatImage
 
 
 @state_new_names
@@ -42,6 +42,16 @@ class Residual:
         f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((0, 0, 59, 39), shape=(40, 60))
+    >>> images = np.random.default_rng(0).uniform(50, 200, (1, 40, 60)).astype(np.float32)
+    >>> reference = Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, element_size=20))
+    >>> residual = Residual.at(reference, Deformed.prepare(images), [np.zeros_like(reference.mesh.nodes)])
+    >>> bool(np.abs(residual.difference).max() < 1e-4)  # both states are the same
+    True
     """
 
     reference: Reference
@@ -68,14 +78,18 @@ class Residual:
         values = reference.values
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
+        is_changed = np.empty(moments.shape[:2], dtype=bool)
         for light, displacement in enumerate(displacements):
             warp = reference.warp(deformed, light, displacement)
             differences(deformed.coefficients[light], values[light], *warp, difference[light])
             images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
-            warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
-        brightness = reference.brightness_of(weights, moments)
+            states = *images, reference.pixel_weights[light]
+            warped_weights(*states, *warp, weights[light], moments[light], is_changed[light])
+        brightness = reference.brightness_of(weights, moments, np.asarray(is_changed.any(axis=1)))
         for light, light_difference in enumerate(difference):
-            reference.correct_brightness(brightness, light, light_difference)
+            fields = reference.brightness_fields(brightness, light, light_difference)
+            pixels = reference.pixels
+            correct_brightness(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, light_difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -104,6 +118,25 @@ class Residual:
         out = np.empty((len(weights), len(pixels.origin), 3))
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
+
+    def with_values(self, values: FloatImage) -> Residual:
+        """Return it for other grey levels (k, P) of the reference, with the brightness as it is.
+
+        Parameters
+        ----------
+        values : ndarray, shape (k, P), float32
+            Such as those of a reference before `Reference.filtered_as`.
+
+        Returns
+        -------
+        Residual
+        """
+        if values is self.reference.values:
+            return self
+        difference = values - self.reference.values
+        difference *= self.reference.inverse_level
+        difference += self.difference
+        return replace(self, difference=difference)
 
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
@@ -137,6 +170,11 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+
+    Examples
+    --------
+    >>> Precision(factor=np.ones((3, 100), np.float32), loss_curvature=np.ones(100, np.float32)).factor.shape
+    (3, 100)
     """
 
     factor: FloatImage
@@ -164,7 +202,16 @@ class Precision:
 
 
 class PrecisionMethod(Protocol):
-    """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own."""
+    """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own.
+
+    Examples
+    --------
+    >>> class EqualLights:
+    ...     def precision(self, residual: Residual) -> Precision:
+    ...         factor = np.ones_like(residual.weights)
+    ...         return Precision(factor=factor, loss_curvature=factor[0])
+    >>> method: PrecisionMethod = EqualLights()
+    """
 
     def precision(self, residual: Residual) -> Precision | None:
         """Precision of the lights for the next pass; None leaves the weights as they are given.
@@ -225,10 +272,11 @@ _MIN_PIXELS = 12
 def brightness_change(
     first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
 ) -> FloatArray:
-    """Gain and offset of every light, ``second = gain first + offset``, as the median over the elements.
+    """Return gain and offset of every light, ``second = gain first + offset``, between two states in grey levels.
 
-    The gain is the ratio of the speckle's contrasts (what the lamp gives), which noise that is alike in both states
-    changes little; the offset is what the mean has beyond that (reflections, stray light).
+    They are those of `gain_and_offset`, whatever the solve takes of them, against the first reference, and of a lamp
+    that is off, too: the gain is what the lamp gives, the offset what the mean has beyond that (reflections, stray
+    light) in the middle of the elements.
 
     Parameters
     ----------
@@ -245,14 +293,12 @@ def brightness_change(
     ndarray, shape (k, 2)
         Gain and offset (grey levels); NaN where no element is seen in both states.
     """
-    mesh, pixels = reference.mesh, reference.pixels
-    max_elements, sample_count = (
-        400,
-        36,
-    )  # elements: their median is known to 6 % of the scatter; pixels: a contrast to 12 %
-    elements = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // max_elements))
+    mesh, pixels, sample_count = reference.mesh, reference.pixels, 36  # a contrast of 36 pixels is known to 12 %
+    elements = np.arange(0, len(mesh.elements), 1 + len(mesh.elements) // ELEMENTS)
     motion, size = displacement[mesh.elements[elements]].mean(axis=1), np.diff(pixels.offsets)[elements]
     usable = np.isfinite(motion).all(axis=1) & (size >= _MIN_PIXELS)
+    if not usable.any():
+        return np.full((len(first), 2), np.nan)
     elements, step, size = elements[usable], np.round(motion[usable]).astype(np.int64), size[usable]
     slots = pixels.offsets[elements, None] + np.arange(sample_count) * size[:, None] // sample_count
     columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[elements, :1]
@@ -260,32 +306,17 @@ def brightness_change(
     height, width = second.shape[1:]
     across, down = columns + step[:, :1], rows + step[:, 1:]
     inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
-    target_index = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
-    f, g = (
-        np.take(images.reshape(len(images), -1), at, axis=1)
-        for images, at in ((first, rows * first.shape[2] + columns), (second, target_index))
-    )
-    return np.array([_gain_and_offset(*pair, inside) for pair in zip(f, g, strict=True)])
-
-
-def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[float, float]:
-    """Estimate gain and offset of one light from the samples (E, n) of elements."""
+    f = first[:, rows, columns].astype(np.float64)
+    g = second[:, np.clip(down, 0, height - 1), np.clip(across, 0, width - 1)].astype(np.float64)
     valid = inside & np.isfinite(f) & np.isfinite(g)
-    valid &= valid.sum(axis=1, keepdims=True) >= _MIN_PIXELS
-    has_data = np.asarray(valid.any(axis=1))
-    valid, number = valid[has_data], valid[has_data].sum(axis=1)
-
-    def moments(values: FloatImage) -> tuple[FloatArray, FloatArray]:
-        exact = np.where(valid, values[has_data], 0).astype(np.float64)
-        mean = exact.sum(axis=1) / number
-        return mean, np.maximum((exact**2).sum(axis=1) / number - mean**2, 0)
-
-    (mean_f, contrast_f), (mean_g, contrast_g) = moments(f), moments(g)
-    textured = contrast_f > 0.05 * np.median(contrast_f) if has_data.any() else has_data[:0]
-    if not textured.any():
-        return float("nan"), float("nan")
-    gain = float(np.median(np.sqrt(contrast_g[textured] / contrast_f[textured])))
-    return gain, float(np.median(mean_g[textured] - gain * mean_f[textured]))
+    valid &= valid.sum(axis=-1, keepdims=True) >= _MIN_PIXELS
+    f, g = np.where(valid, f, 0), np.where(valid, g, 0)
+    moments = np.stack(
+        [valid.sum(axis=-1), *(product.sum(axis=-1) for product in (f, g, f * f, f * g, g * g))], axis=-1
+    )
+    centres = mesh.centres[elements]
+    gain, offset = gain_and_offset(moments, centres - centres.mean(axis=0), -1.0)
+    return np.stack([gain, np.where(np.isfinite(gain), offset[:, 0], np.nan)], axis=1)
 
 
 _FITTED_PAIRS = 12

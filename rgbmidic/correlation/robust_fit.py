@@ -27,13 +27,11 @@ def robust_fit(basis: FloatArray, values: FloatArray, ridge: float, scale: float
         Coefficients.
     """
     basis, values = (np.ascontiguousarray(array.T) for array in (basis, values))  # one fit beside the other in memory
-    weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
+    functions, weight, held = np.concatenate([basis, values]), np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
     for _ in range(5):  # until the weights have settled: twice as many change results by 1e-11 px
         # no BLAS, whose sums may depend on the number of threads
-        sums = np.array([[(function * side).sum(axis=0) for side in (*basis, *values)] for function in basis * weight])
-        coefficients = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
-        fitted = sum(
-            function * slope[:, None] for function, slope in zip(basis, coefficients.transpose(1, 2, 0), strict=True)
-        )
+        sums = np.einsum("akt,bkt->tab", basis * weight, functions)
+        coefficients = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])
+        fitted = np.einsum("akt,tac->ckt", basis, coefficients)
         weight = 1 / (1 + ((values - fitted) ** 2).sum(axis=0) / scale**2)
-    return coefficients
+    return np.asarray(coefficients)

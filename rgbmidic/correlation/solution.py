@@ -28,7 +28,15 @@ DISPUTED = 0.1
 
 
 class Status(IntEnum):
-    """Status of a frame."""
+    """Status of a frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rgbmidic import Status, correlate
+    >>> correlate(np.zeros((60, 60)), np.zeros((60, 60))).status is Status.FAILED
+    True
+    """
 
     CONVERGED = 0
     NOT_CONVERGED = 1
@@ -36,7 +44,16 @@ class Status(IntEnum):
 
 
 class NodeStatus(IntEnum):
-    """Status of a node."""
+    """Status of a node.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> result = Result.open("my_result")
+    >>> measured = result.node_status[1] == NodeStatus.MEASURED
+    >>> measured.shape == (len(result.nodes),)
+    True
+    """
 
     MEASURED = 0
     NOT_SEEN = 1
@@ -92,6 +109,17 @@ class Solution(HtmlRepr):
         the region that any light sees.
     history : ndarray, shape (iterations,), float64
         Largest motion of a measured node in each iteration, px.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=40)
+    >>> solution.displacement.shape == solution.displacement_std.shape == (len(solution.nodes), 2)
+    True
+    >>> bool(solution.displacement_std[solution.measured].max() < 0.05)
+    True
     """
 
     nodes: FloatArray
@@ -244,6 +272,17 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     Returns
     -------
     Solution
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import correlate
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> speckle[25:55, 25:55] = np.nan
+    >>> solution = correlate(speckle, np.roll(speckle, 1, axis=1), element_size=12)
+    >>> filled = fill(Tri3Mesh(nodes=solution.nodes, elements=solution.elements), solution, longest=40.0)
+    >>> np.isnan(solution.displacement).any(), np.isnan(filled.displacement).any()
+    (np.True_, np.False_)
     """
     measured = solution.measured
     if measured.all() or measured.sum() < 6:

@@ -96,8 +96,10 @@ def next_weighting(
 ) -> Weighting:
     """Find residual, matching and precision anew at the displacement found by pass `number`."""
     residual, method = compare(problem, estimate), problem.method
+    # the residual that the pass has minimised: by other grey levels the displacement is not yet the best
+    minimised = residual.with_values(last.residual.reference.values)
     # without the precision of the lights, which the first pass has not, an element half on another body may match
-    precision = last.precision if number or method is None else method.precision(residual)
+    precision = last.precision if number or method is None else method.precision(minimised)
     matched = matching_elements(residual, estimate.displacement, precision)
     if not matched.all() or estimate.longest > problem.constants.first_pass_tolerance:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
@@ -110,7 +112,7 @@ def next_weighting(
         return weighting
     return replace(
         weighting,
-        precision=precision if number == 0 or method is None else method.precision(residual),
+        precision=precision if number == 0 or method is None else method.precision(minimised),
         weighting_displacement=estimate.displacement,
     )
 
@@ -199,6 +201,19 @@ def solve(
     ------
     InputError
         The two states have different numbers of images, or `initial` does not fit the mesh.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> deformed = Deformed.prepare(np.roll(speckle, 1, axis=2))
+    >>> solution = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), SolverSettings(), None)
+    >>> solution.displacement.mean(axis=0).round(2).tolist()
+    [1.0, 0.0]
     """
     if len(deformed.weights) != len(reference.images):
         raise InputError(
@@ -239,15 +254,15 @@ def _passes(
         equations = _equations(problem, weighting, estimate)
         pass_tolerance = max(tolerance, problem.constants.first_pass_tolerance) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
+        reference = problem.reference
+        if number == 0:
+            problem = replace(problem, reference=reference.filtered_as(estimate.displacement))
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            reference = with_consistent_gradient(weighting.residual, weighting.weights()).filtered_as(
-                estimate.displacement
-            )
-            if reference is not problem.reference:
-                same, problem = reference.values is problem.reference.values, replace(problem, reference=reference)
-                residual = replace(weighting.residual, reference=reference) if same else compare(problem, estimate)
-                weighting, equations = replace(weighting, residual=residual), None
+            problem = replace(problem, reference=with_consistent_gradient(weighting.residual, weighting.weights()))
+            if problem.reference is not reference:
+                weighting = replace(weighting, residual=replace(weighting.residual, reference=problem.reference))
+                equations = None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.nodes import correlation_around, torn_elements
-from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.nodes import correlation_around
+from rgbmidic.correlation.reference import Deformed, Reference, torn_elements
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, interpolate_motion
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
 from rgbmidic.correlation.solve import solve
@@ -322,6 +322,18 @@ def find_initial_guess(reference: Reference, deformed: Deformed) -> InitialGuess
     -------
     InitialGuess
         The surest of `Search.candidates`; rest, with the confidence 0, where there is none.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> guess = find_initial_guess(reference, Deformed.prepare(np.roll(speckle, 3, axis=2)))
+    >>> guess.displacement.mean(axis=0).round()
+    array([3., 0.])
     """
     no_guess = InitialGuess(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
     return max(Search().candidates(reference, deformed), key=lambda guess: guess.confidence, default=no_guess)
@@ -373,6 +385,11 @@ class TrackingState:
         The frames that have become the reference in turn.
     best_match : float
         How well a frame has matched the last of them, see `ReferenceUpdate.match`; 0 where none has.
+
+    Examples
+    --------
+    >>> TrackingState(displacement=None).reference_updates
+    ()
     """
 
     displacement: FloatArray | None
@@ -436,6 +453,19 @@ def track(
     -------
     Solution
         The best of those from each initial guess.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> from rgbmidic.settings import SolverSettings
+    >>> random = np.random.default_rng(0)
+    >>> speckle = 2 + gaussian_filter(random.normal(size=(1, 80, 80)), (0, 1.5, 1.5)).astype(np.float32)
+    >>> region = Region.from_rectangle((10, 10, 69, 69), shape=(80, 80))
+    >>> reference = Reference.prepare(speckle, region, mesh=Tri3Mesh.from_region(region, element_size=30))
+    >>> deformed, state = Deformed.prepare(np.roll(speckle, 3, axis=2)), TrackingState(displacement=None)
+    >>> track(reference, deformed, state, SolverSettings(), None).displacement.mean(axis=0).round(2).tolist()
+    [3.0, 0.0]
     """
     best: Solution | None = None
     surest = 0.0

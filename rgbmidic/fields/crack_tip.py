@@ -93,6 +93,12 @@ class Williams:
         Highest term N of the series; 0: the least one that a chi-square test accepts in all frames.
     fit_tip
         Whether the tip's place along the crack is fitted in every frame; else it is that of the mesh.
+
+    Examples
+    --------
+    >>> steel = Williams(youngs_modulus=210e3, poissons_ratio=0.3, plane="stress", units=Units(mm_per_pixel=0.05))
+    >>> round(steel.kolosov, 3)
+    2.077
     """
 
     youngs_modulus: float
@@ -117,7 +123,7 @@ class Williams:
         if self.units.mm_per_pixel is None:
             raise InputError(
                 "stress intensity factors, in MPa √m, need the scale of the image: state mm_per_pixel or camera in "
-                "[scale] (`rgbmidic scale` finds the former), and no lengths in px (--px, scale.unit)"
+                "[scale] (`rgbmidic scale` finds the former), and no lengths in px (scale.unit)"
             )
 
     @property
@@ -175,6 +181,22 @@ class StressIntensity:
         Of the fit over its degrees of freedom: 1 where the series describes the field within its stated uncertainty.
     terms
         Highest term of the series.
+
+    Examples
+    --------
+    >>> zero = np.zeros((1, 2))
+    >>> intensity = StressIntensity(
+    ...     factors=zero + 25.0,
+    ...     factors_std=zero + 0.5,
+    ...     t_stress=zero[:, 0],
+    ...     t_stress_std=zero[:, 0] + 3,
+    ...     extension=None,
+    ...     extension_std=None,
+    ...     chi_square=zero[:, 0] + 1,
+    ...     terms=4,
+    ... )
+    >>> intensity.factors[0].tolist()  # MPa √m
+    [25.0, 25.0]
     """
 
     factors: FloatArray
@@ -497,6 +519,18 @@ def stress_intensity(
     InputError
         The place is no tip of the mesh, the crack is not straight up to the outer radius, or the annulus leaves the
         region, has too few nodes, or reaches into the elements at the tip.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((0, 0, 140, 140), shape=(160, 160))
+    >>> mesh = Tri3Mesh.from_region(region, element_size=16, cracks=[[(0, 70), (70, 70)]])
+    >>> zero = np.zeros((1, len(mesh.nodes)))
+    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
+    >>> steel = Williams(youngs_modulus=210e3, poissons_ratio=0.3, plane="stress", units=Units(mm_per_pixel=0.05))
+    >>> result = stress_intensity(mesh.nodes, mesh.elements, still, (70, 70), (32, 68), steel)
+    >>> np.abs(result.factors).max() < 1e-9
+    np.True_
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = CrackTip(covariance, "the tip", *tip, *radii, williams=williams)

@@ -36,6 +36,14 @@ class Jump:
         Jump across the deformed crack, positive where it is open, and its standard uncertainty.
     sliding, sliding_std : ndarray, shape (T, P)
         Jump along it, positive where the left side is ahead.
+
+    Examples
+    --------
+    >>> zero = np.zeros((1, 3))
+    >>> places = {"distance": zero[0], "points": np.zeros((3, 2))}
+    >>> jump = Jump(**places, opening=zero, opening_std=zero, sliding=zero, sliding_std=zero)
+    >>> jump.opening.shape
+    (1, 3)
     """
 
     distance: FloatArray
@@ -203,6 +211,16 @@ def crack_jump(
     ------
     InputError
         The mesh has no crack, a point is not on one, or no pair of nodes lies between them.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((0, 0, 80, 60), shape=(80, 100))
+    >>> mesh = Tri3Mesh.from_region(region, element_size=10, cracks=[[(0, 30), (40, 30)]])
+    >>> zero = np.zeros((1, len(mesh.nodes)))
+    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
+    >>> crack_jump(mesh.nodes, mesh.elements, still, (5, 30), (35, 30)).opening.tolist()
+    [[0.0, 0.0, 0.0, 0.0]]
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = JumpAlong(covariance, "the crack", *start, *end)

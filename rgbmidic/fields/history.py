@@ -41,6 +41,12 @@ class Nodal:
         Displacement and its standard uncertainty.
     u_bias, v_bias : ndarray, shape (T, m)
         The part of the uncertainty that the bias of the lights leaves, which nodes near each other have in common.
+
+    Examples
+    --------
+    >>> u, zero = np.array([[0.0, 0.0], [0.5, 0.6]]), np.zeros((2, 2))
+    >>> Nodal(u=u, v=zero, u_std=zero + 0.01, v_std=zero + 0.01).u.shape  # of two nodes in two frames
+    (2, 2)
     """
 
     u: FloatArray
@@ -94,6 +100,11 @@ class History:
         Standard uncertainty; None for what was not measured by the images, or has none.
     note
         What a reader should know of it, else empty.
+
+    Examples
+    --------
+    >>> History(name="point_1_u", unit="px", values=np.array([0.0, 0.5]), std=np.array([0.0, 0.01])).name
+    'point_1_u'
     """
 
     name: str
@@ -129,6 +140,15 @@ class Probe(Protocol):
         First part of the names of its histories.
     nodes : ndarray, shape (m,)
         The nodes that it needs.
+
+    Examples
+    --------
+    >>> class Midpoint:
+    ...     name, nodes = "middle", np.array([4])
+    ...
+    ...     def histories(self, displacement: Nodal) -> tuple[History, ...]:
+    ...         return (History(name="middle_u", unit="px", values=displacement.u[:, 0], std=None),)
+    >>> probe: Probe = Midpoint()
     """
 
     @property
@@ -165,6 +185,13 @@ class Rates:
     velocity_before, velocity_after, acceleration_before, acceleration_after : ndarray, shape (T, ...)
         From the frames up to this one, and from this one on, with their standard uncertainties; NaN but in frames where
         they differ by more than four times these, that is, at kinks.
+
+    Examples
+    --------
+    >>> times = np.arange(20) * 1e-3
+    >>> result = rates(times, 50 * times, np.full(20, 0.01), window=10, common_fraction=0.0, references=[False] * 20)
+    >>> result.velocity.shape == result.velocity_std.shape == (20,)
+    True
     """
 
     value: FloatArray
@@ -257,6 +284,13 @@ def rates(
     ------
     InputError
         The times do not rise, shapes differ, or no window has enough frames.
+
+    Examples
+    --------
+    >>> times = np.arange(20) * 1e-3
+    >>> result = rates(times, 50 * times, np.full(20, 0.01), window=10, common_fraction=0.0, references=[False] * 20)
+    >>> result.velocity[10].round(6), result.acceleration[10].round(6) + 0
+    (np.float64(50.0), np.float64(0.0))
     """
     frame_times, quantity, error = (np.asarray(array, dtype=np.float64) for array in (times, values, std))
     references = np.asarray(references, dtype=bool)
@@ -347,6 +381,11 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
     ------
     InputError
         `field` is not one image, or nothing in it is measured.
+
+    Examples
+    --------
+    >>> high_pass(np.tile(np.arange(60.0), (50, 1)), sigma=5.0).round(6).max() + 0  # a slope is smooth
+    np.float64(0.0)
     """
     values = np.asarray(field, dtype=np.float64)
     if values.ndim != 2 or not 0 < sigma < 1e6:

@@ -45,6 +45,14 @@ class MeshPoints:
         The element that holds the point, the nearest one for a point outside.
     barycentric : ndarray, shape (P, 3)
         Value of the shape functions of that element's nodes at the point.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> points = MeshPoints.of(mesh, np.array([[30.0, 25.0], [95.0, 25.0]]))
+    >>> points.inside.tolist()
+    [True, False]
     """
 
     mesh: Tri3Mesh
@@ -379,6 +387,13 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
     ------
     InputError
         The values are not those of the nodes, or there is no such image.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> at_pixels(mesh, 0.01 * mesh.nodes[:, :1], (80, 100))[0, 30, [20, 40, 99]].round(3).tolist()
+    [0.20000000298023224, 0.4000000059604645, nan]
     """
     if values.ndim != 2 or len(values) != len(mesh.nodes) or min(shape) < 1:
         raise InputError(
@@ -411,6 +426,12 @@ def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
     ------
     InputError
         No such field, or no such nodes.
+
+    Examples
+    --------
+    >>> field = np.stack([np.tile(np.arange(5.0), (4, 1))])
+    >>> at_nodes(field, np.array([[2.5, 1.0]])).tolist()
+    [[2.5]]
     """
     if field.ndim != 3 or min(field.shape[1:]) < 2 or nodes.shape[1:] != (2,) or not np.isfinite(nodes).all():
         raise InputError(
@@ -451,6 +472,13 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
     ------
     InputError
         The values are not those of the nodes, or the truth has other components.
+
+    Examples
+    --------
+    >>> nodes, elements = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]), np.array([[0, 1, 2]], dtype=np.int32)
+    >>> mesh = Tri3Mesh(nodes=nodes, elements=elements)
+    >>> field_rms(mesh, np.zeros((3, 2)), np.full((2, 5, 5), 0.5))
+    0.5
     """
     if truth.ndim != 3 or values.shape[1:] != truth.shape[:1]:
         raise InputError(f"a truth (C, H, W) is compared with values (N, C), not {truth.shape} with {values.shape}")

@@ -52,6 +52,14 @@ class NodalCovariance:
     bias : csr_matrix, shape (n, S)
         Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
         ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> covariance = NodalCovariance.from_mesh(mesh)
+    >>> covariance.fit.shape[0] == len(mesh.nodes)
+    True
     """
 
     mesh: Tri3Mesh
@@ -225,6 +233,11 @@ def reference_fraction(count: int) -> float:
     ------
     InputError
         There is no reference frame.
+
+    Examples
+    --------
+    >>> reference_fraction(1), reference_fraction(4)
+    (0.5, 0.2)
     """
     if count < 1:
         raise InputError(f"a reference is of one frame or more, not {count}")
@@ -258,6 +271,11 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
     ------
     InputError
         The fraction is not in 0 to 1/2, or not every frame has a statement of its reference.
+
+    Examples
+    --------
+    >>> frame_covariance(np.array([0.0, 0.1, 0.1]), 0.5, [True, False, False]).round(6).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.01, 0.005], [0.0, 0.005, 0.01]]
     """
     variance, reference = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
     if not 0 < common_fraction <= 0.5 or reference.ndim != 1 or variance.shape[:1] != reference.shape:
@@ -292,6 +310,11 @@ def difference_std(first: FloatArray, second: FloatArray, common_fraction: float
     ------
     InputError
         The uncertainties are not of one shape.
+
+    Examples
+    --------
+    >>> difference_std(np.array([0.02]), np.array([0.02]), common_fraction=0.5).round(6).tolist()
+    [0.02]
     """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if 1 not in (first.size, second.size) and first.shape != second.shape:
@@ -312,6 +335,15 @@ class RigidMotion:
         In px.
     rotation, rotation_std : float
         In rad, from x towards y.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> zero = np.zeros(len(mesh.nodes))
+    >>> motion = RigidMotion.of(NodalCovariance.from_mesh(mesh), zero + 1, zero, zero + 0.01, zero + 0.01)
+    >>> motion.shift.round(6).tolist()
+    [1.0, 0.0]
     """
 
     centre: FloatArray

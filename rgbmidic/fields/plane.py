@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
@@ -96,6 +97,13 @@ class CameraCalibration:
         Other content of the file: residuals, views, tilt, provenance.
     name : str
         File name, for messages.
+
+    Examples
+    --------
+    >>> camera = CameraCalibration(shape=(400, 600), homography=np.diag([0.05, 0.05, 1.0]))
+    >>> scale, std = camera.scale(np.array([300.0, 200.0]))
+    >>> round(scale, 6), std
+    (0.05, 0.0)
     """
 
     shape: tuple[int, int]
@@ -131,7 +139,7 @@ class CameraCalibration:
         """Parameters (16,) of the map, in the order of `covariance`."""
         lens = np.r_[1.0, self.centre, np.zeros(5)] if self.lens is None else self.lens
         if self.homography is None:
-            raise InputError(f"{self.name} holds no plane: calibrate with --plane, a photograph of the target on it")
+            raise InputError(f"{self.name} holds no plane: photograph the target on it (`rgbmidic-calibrate camera`)")
         return np.asarray(np.r_[lens, self.homography.ravel()[:8]])
 
     def to_mm(self, points: FloatArray, parameters: FloatArray | None = None) -> FloatArray:
@@ -415,6 +423,7 @@ class CameraCalibration:
             return False
 
     @classmethod
+    @checked
     def read(cls, path: Path | str) -> Self:
         """Read the file that ``rgbmidic-calibrate camera`` wrote.
 
@@ -520,6 +529,13 @@ class Rectification:
     units
         With the millimetres for a rectified px, or for a px where a scale is stated in place of a camera. Chosen such
         that the median element of both meshes has one size.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> Rectification(camera=None, image=mesh, mesh=mesh, units=Units()).probe_coordinates((40.0, 30.0), 1)
+    (40.0, 30.0)
     """
 
     camera: CameraCalibration | None

@@ -73,6 +73,14 @@ class Mean:
         Of the nodes' errors.
     min_fraction
         Part of the points in the region that must be measured; the mean is that of the measured part.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> probe = make_probe(NodalCovariance.from_mesh(mesh), "point", 1, (40, 30))
+    >>> type(probe) is Mean, probe.name
+    (True, 'point_1')
     """
 
     name: str
@@ -366,6 +374,14 @@ class Area(Mean):
     ------
     InputError
         Half of the area or more is outside the region.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> area = make_probe(NodalCovariance.from_mesh(mesh), "region", 1, (20, 20, 60, 40))
+    >>> type(area) is Area, area.name
+    (True, 'region_1')
     """
 
     def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
@@ -447,6 +463,16 @@ def make_probe(
     ------
     InputError
         The place is outside the region, or no place for it.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> gauge = make_probe(NodalCovariance.from_mesh(mesh), "gauge", 1, (20, 30, 60, 30))
+    >>> zero = np.zeros((2, len(gauge.nodes)))
+    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
+    >>> [(history.name, history.values.tolist()) for history in gauge.histories(still)][:1]
+    [('gauge_1_extension', [0.0, 0.0])]
     """
     (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")

@@ -137,6 +137,15 @@ class ProfileLine:
     ------
     InputError
         Both ends are the same, or half of the line or more is outside the mesh.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> covariance = NodalCovariance.from_mesh(mesh)
+    >>> line = ProfileLine(covariance, StrainGauges.at_nodes(covariance), 0, 30, 80, 30)
+    >>> line.positions[[0, -1]].round(6).tolist()
+    [0.0, 80.0]
     """
 
     def __init__(

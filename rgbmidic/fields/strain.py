@@ -76,6 +76,13 @@ class Strain:
         its uncertainty.
     shear, shear_std : ndarray, shape (...)
         Largest shear angle in the plane, ``e1 - e2``: engineering shear, twice the tensor's. Positive, see `length_of`.
+
+    Examples
+    --------
+    >>> stretch = np.array([[0.1, 0.0], [0.0, -0.03]])
+    >>> strain = strain_of_gradient(stretch, np.zeros((4, 4)), "engineering")
+    >>> strain.components.round(6).tolist(), strain.principal.round(6).tolist()
+    ([0.1, -0.03, 0.0], [0.1, -0.03])
     """
 
     measure: str
@@ -137,6 +144,12 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     ------
     InputError
         The measure is unknown.
+
+    Examples
+    --------
+    >>> gradient = np.array([[0.1, 0.0], [0.0, 0.0]])
+    >>> strain_of_gradient(gradient, np.zeros((4, 4))).components[0].round(6)  # Green-Lagrange
+    np.float64(0.105)
     """
     if measure not in MEASURES:
         raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
@@ -239,6 +252,13 @@ def shortest_gauge(mesh: Tri3Mesh) -> float:
     -------
     float
         In px.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> round(shortest_gauge(mesh), 6)
+    60.0
     """
     return SHORTEST * mesh.size
 
@@ -278,6 +298,15 @@ def strain_of(
     ------
     InputError
         The gauge is too short, or the measure unknown.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region, Tri3Mesh
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> u, zero = 0.01 * mesh.nodes[:, 0], np.zeros(len(mesh.nodes))
+    >>> strain = strain_of(mesh.nodes, mesh.elements, u, zero, zero + 0.01, zero + 0.01, measure="engineering")
+    >>> strain.components.round(6)[0].tolist()
+    [0.01, 0.0, 0.0]
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     return StrainGauges.at_nodes(covariance, gauge).strain(u, v, *std, measure=measure)
@@ -321,6 +350,16 @@ class StrainGauges:
     ------
     InputError
         The gauge is too short.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import Region
+    >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
+    >>> gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh))
+    >>> u, zero = 0.01 * mesh.nodes[:, 0], np.zeros(len(mesh.nodes))
+    >>> strain = gauges.strain(u, zero, zero + 0.01, zero + 0.01)
+    >>> strain.components.round(6)[0].tolist()
+    [0.01005, 0.0, 0.0]
     """
 
     def __init__(

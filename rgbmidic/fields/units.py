@@ -25,6 +25,12 @@ class Units:
         Its standard uncertainty. It contributes to that of every length in mm, as the same factor in all of them.
     timed
         Whether the frames' times are known; else a frame is the unit of time.
+
+    Examples
+    --------
+    >>> units = Units(mm_per_pixel=0.05, timed=True)
+    >>> units.length, units.time
+    ('mm', 's')
     """
 
     mm_per_pixel: float | None = None

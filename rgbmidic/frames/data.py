@@ -32,6 +32,12 @@ class Window:
         Its rows and columns.
     frame
         Rows and columns of the frame.
+
+    Examples
+    --------
+    >>> window = Window.of_frame((40, 60))
+    >>> window.origin, window.is_whole
+    ((0, 0), True)
     """
 
     origin: tuple[int, int]
@@ -117,6 +123,11 @@ def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
     ------
     InputError
         The name is not a Bayer pattern.
+
+    Examples
+    --------
+    >>> cfa_channels("RGGB").tolist()
+    [[0, 1], [1, 2]]
     """
     name = cfa.upper() if isinstance(cfa, str) else ""
     if name not in BAYER_PATTERNS:
@@ -168,6 +179,12 @@ class Mosaic:
         Black level (DN) of each position of the 2x2 cell.
     white_level : float
         Smallest grey level (DN) that counts as saturated.
+
+    Examples
+    --------
+    >>> values = np.full((40, 60), 100, dtype=np.uint16)
+    >>> Mosaic(values=values, cfa="RGGB", black_level=16, white_level=4095).black_level.tolist()
+    [[16.0, 16.0], [16.0, 16.0]]
     """
 
     values: npt.NDArray[np.uint16]
@@ -198,6 +215,12 @@ class ChannelFrame:
         Black level (DN) of each channel.
     white_level : float
         Smallest grey level (DN) that counts as saturated.
+
+    Examples
+    --------
+    >>> values = np.full((3, 40, 60), 100, dtype=np.uint16)
+    >>> ChannelFrame(values=values, black_level=np.zeros(3), white_level=4095.0).values.shape
+    (3, 40, 60)
     """
 
     values: npt.NDArray[np.uint16]
@@ -286,6 +309,11 @@ class Recording:
     remarks
         What else in the header a user should know. Times that do not rise from frame to frame are left out, with a
         remark; so is one made of a frame rate that is not theirs.
+
+    Examples
+    --------
+    >>> Recording(count=3, frame_rate=100_000.0).count
+    3
     """
 
     count: int = 1

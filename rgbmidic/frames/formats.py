@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, NoReturn, TypedDict, Unpack
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.bitmaps import BmpFile, PgmFile
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
@@ -44,6 +45,13 @@ class FrameFormat:
         by its ending.
     source
         Its reader; built with `path` and `user_metadata`, it reads nothing yet.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> text_format = FrameFormat(name="text", endings=(".txt",), source=FrameSource)
+    >>> text_format.reads(Path("frame.txt"), FrameSettings(path="frame.txt"))
+    True
     """
 
     name: str
@@ -133,6 +141,11 @@ def frame_formats() -> tuple[FrameFormat, ...]:
     Returns
     -------
     tuple of FrameFormat
+
+    Examples
+    --------
+    >>> any(".dng" in frame_format.endings for frame_format in frame_formats())
+    True
     """
     return (*FORMATS, *_plugin_formats())
 
@@ -153,8 +166,7 @@ _ADVICE = (
     ),
     (
         (".raw", ".bin"),
-        "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or --shape and "
-        "--dtype)",
+        "a file without a camera's header: state its `shape` and `dtype` (frames.shape and frames.dtype)",
     ),
 )
 """By endings, what files are that are no frames, and what to do."""
@@ -195,6 +207,13 @@ def open_source(path: Path | str, user_metadata: FrameSettings, camera: CameraMe
     -------
     FrameSource
         Of the first of `FORMATS` that recognises the file.
+
+    Examples
+    --------
+    >>> from rgbmidic.frames import list_frames
+    >>> path = list_frames("frames")[0]
+    >>> open_source(path, FrameSettings(path=str(path))).read(0).cfa
+    'RGGB'
     """
     path = Path(path)
     source = next(
@@ -215,6 +234,7 @@ class FrameMetadata(TypedDict, total=False):
     dtype: Literal["uint8", "uint16", ">u2"] | None
 
 
+@checked
 def read_frame(path: Path | str, **metadata: Unpack[FrameMetadata]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
@@ -254,6 +274,7 @@ def read_frame(path: Path | str, **metadata: Unpack[FrameMetadata]) -> Mosaic | 
     >>> frame = read_frame("frame.tif", cfa="RGGB", black_level=16, white_level=1023)
     >>> frame.values.shape, frame.cfa, frame.white_level
     ((4, 6), 'RGGB', 1023.0)
+    >>> Path("frame.tif").unlink()
     """
     if unknown := metadata.keys() - FrameMetadata.__annotations__:
         raise TypeError(f"read_frame takes {', '.join(FrameMetadata.__annotations__)}, not {', '.join(unknown)}")

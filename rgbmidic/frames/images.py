@@ -161,6 +161,12 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
         The frame is too small, a level is not a whole number, or a factor is not positive.
     FrameError
         The file cannot be written.
+
+    Examples
+    --------
+    >>> values = np.full((24, 32), 100, dtype=np.uint16)
+    >>> write_dng("flat.dng", Mosaic(values=values, cfa="RGGB", black_level=np.full((2, 2), 16.0), white_level=1023.0))
+    >>> Path("flat.dng").unlink()
     """
     if min(mosaic.values.shape) < 22:
         raise InputError(
@@ -188,6 +194,13 @@ def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
     ------
     FrameError
         The file cannot be written.
+
+    Examples
+    --------
+    >>> values = np.full((1, 4, 6), 100, dtype=np.uint16)
+    >>> frame = ChannelFrame(values=values, black_level=np.zeros(1), white_level=1023.0)
+    >>> write_tiff("flat.tif", frame)
+    >>> Path("flat.tif").unlink()
     """
     if isinstance(frame, ChannelFrame) and len(frame.values) == 3:
         _write(path, np.ascontiguousarray(np.moveaxis(frame.values, 0, -1)), photometric="rgb")

@@ -34,6 +34,13 @@ def read_mask(path: Path) -> FloatImage:
     ------
     FrameError
         The file is missing, damaged or no picture, or has values that are negative or not finite.
+
+    Examples
+    --------
+    >>> np.save("mask.npy", np.array([[0, 255], [255, 51]], dtype=np.uint8))
+    >>> read_mask(Path("mask.npy")).tolist()
+    [[0.0, 1.0], [1.0, 0.20000000298023224]]
+    >>> Path("mask.npy").unlink()
     """
     from PIL import Image, UnidentifiedImageError
 

@@ -185,6 +185,11 @@ class StoredFrame:
         Grey level (DN) of a saturated sample.
     bits
         Bits of a sample where they are fewer than those of its type.
+
+    Examples
+    --------
+    >>> StoredFrame(values=np.zeros((40, 60), dtype=np.uint16), bits=12).bits
+    12
     """
 
     values: AnyArray = field(default_factory=lambda: np.empty((0, 0), dtype=np.uint16))

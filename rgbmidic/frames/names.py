@@ -42,6 +42,11 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     ------
     FrameError
         Nothing matches.
+
+    Examples
+    --------
+    >>> [path.suffix for path in list_frames("frames")][:2]
+    ['.dng', '.dng']
     """
     text, dataset = split_dataset(pattern)
     full_path = Path(base) / text

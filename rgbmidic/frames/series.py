@@ -49,6 +49,12 @@ class FrameSeries:
         Index in that series of the frame that each state begins with; by default every `n_lights`-th.
     selected
         The states that are to be measured; by default all.
+
+    Examples
+    --------
+    >>> series = open_series(FrameSettings(path="frames/*.dng"))
+    >>> series.selected == range(len(series))
+    True
     """
 
     lights: tuple[tuple[FrameSource, ...], ...]
@@ -293,6 +299,12 @@ def open_series(
         No file matches, a movie's header is damaged, a frame has another size than the first, the lights have different
         frames, or a reference frame or the first or last frame does not exist. A damaged file of one frame is left for
         `FrameSeries.read` to report.
+
+    Examples
+    --------
+    >>> series = open_series(FrameSettings(path="frames/*.dng"))
+    >>> series.shape == series.read(0)[0].values.shape
+    True
     """
     if not settings.path:
         raise ConfigurationError(
@@ -504,7 +516,7 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
     if path.suffix.lower() not in TIFF_ENDINGS:
         raise InputError(f"a frame is saved as .tif, not as {path}")
     if path.exists() and not overwrite:
-        raise InputError(f"{path} exists already; --overwrite replaces it")
+        raise InputError(f"{path} exists already; `overwrite=True` replaces it")
     if not path.parent.is_dir():
         raise InputError(f"there is no folder {path.parent} to save {path.name} in")
     write_tiff(path, series.read(index)[0])

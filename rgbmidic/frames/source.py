@@ -36,6 +36,14 @@ class FrameSource(ABC):
         What the user states of it.
     camera
         What a calibration states of it.
+
+    Examples
+    --------
+    >>> from rgbmidic.frames import list_frames, open_source
+    >>> path = list_frames("frames")[0]
+    >>> source = open_source(path, FrameSettings(path=str(path)))
+    >>> isinstance(source, FrameSource), source.read(0).cfa
+    (True, 'RGGB')
     """
 
     packages: ClassVar[tuple[str, ...]] = ()
@@ -165,6 +173,17 @@ class MovieSource(FrameSource):
 
     Of a frame only its own samples are read, whatever the size of the file; a header behind `cache_by_file` is read
     once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rgbmidic.frames import open_source
+    >>> np.save("stack.npy", np.zeros((3, 40, 60), dtype=np.uint16))
+    >>> statement = FrameSettings(path="stack.npy", kind="monochrome", black_level=0, white_level=4095)
+    >>> movie = open_source(Path("stack.npy"), statement)
+    >>> isinstance(movie, MovieSource), movie.recording.count
+    (True, 3)
+    >>> Path("stack.npy").unlink()
     """
 
     @property
@@ -256,6 +275,11 @@ def file_hash(path: Path | str) -> str:
     ------
     FrameError
         The file cannot be read.
+
+    Examples
+    --------
+    >>> file_hash("calibration.json") == file_fingerprint("calibration.json")
+    False
     """
     with require_regular_file(Path(path)).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -279,6 +303,11 @@ def file_fingerprint(path: Path | str) -> str:
     ------
     FrameError
         The file cannot be read.
+
+    Examples
+    --------
+    >>> len(file_fingerprint("calibration.json"))
+    64
     """
     # 256 KiB, in pages of memory, are read in a millisecond; a movie that was exchanged differs in all of them, and one
     # that was cut in its size

@@ -259,6 +259,9 @@ def _stack(path: Path) -> _Pages:
         text = pages.text(entries, Tag.DESCRIPTION)
         shape = (pages.value(entries, Tag.ROWS), pages.value(entries, Tag.COLUMNS))
         samples = math.prod(shape) * (pages.value(entries, Tag.SAMPLES_PER_PIXEL) or 1)
+        frame_bytes = sum(pages.segments(entries)[1])
+        has_room = 0 < frame_bytes * (len(offsets) + 1) < pages.size
+        n_unlisted = pages.unlisted_bytes(offsets) if has_room and not ends_early else 0
     stack, count, remarks = Hyperstack.parse(text, samples), len(offsets) + ends_early, list[str]()
     if stack is None and "<OME" in text[:1000]:
         remarks.append("its OME description cannot be read")
@@ -279,6 +282,11 @@ def _stack(path: Path) -> _Pages:
     if stack and (stack.count != count or sorted(order) != list(range(len(offsets)))):
         remark = f"its text announces {stack.count} images, it holds {count}: the text is not used"
         stack, order, remarks = None, list(range(len(offsets))), remarks if ends_early else [*remarks, remark]
+    if not (stack or remarks) and n_unlisted >= frame_bytes > 0:
+        remarks.append(
+            f"{n_unlisted} bytes of it belong to none of its {count} frames, the first of which takes {frame_bytes}: "
+            "was its list of frames cut?"
+        )
     recording = Recording(count=count, count_is_certain=not ends_early, remarks=tuple(remarks))
     if stack:
         times, planes = stack.times_ns, stack.planes

@@ -46,8 +46,13 @@ class Tag(IntEnum):
     ROWS = 257
     DESCRIPTION = 270
     ORIENTATION = 274
+    STRIP_OFFSETS = 273
     SAMPLES_PER_PIXEL = 277
+    STRIP_BYTES = 279
     COLOUR_MAP = 320
+    TILE_OFFSETS = 324
+    TILE_BYTES = 325
+    SUB_PAGES = 330
     CFA_REPEAT = 33421
     CFA_PATTERN = 33422
     DNG_VERSION = 50706
@@ -57,6 +62,9 @@ class Tag(IntEnum):
     BLACK_DELTA_V = 50716
     ACTIVE_AREA = 50829
 
+
+_VALUE_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+"""Bytes of a value by its type (TIFF 6.0, BigTIFF); 1 of all others."""
 
 Entries = dict[int, tuple[int, int, bytes]]
 """Type, number of values, and the values or where they lie, of the entries of a page by their codes."""
@@ -137,6 +145,44 @@ class PageList:
         if not page_offsets:
             raise damaged_file(path, "its header leads to no image")
         return page_offsets, offset > 0
+
+    def unlisted_bytes(self, page_offsets: list[int]) -> int:
+        """Return the size of the largest area that neither these pages nor their values and samples take."""
+        extents = [(0, 2 * self.offset), (self.size, self.size)]
+        for page_offset in page_offsets:
+            entries, _ = self.page(page_offset) or ({}, 0)
+            if Tag.SUB_PAGES in entries:  # pages that no list leads to
+                return 0
+            extents.append((page_offset, page_offset + 2 * self.offset + len(entries) * (4 + 2 * self.offset)))
+            for kind, number, content in entries.values():
+                n_bytes = _VALUE_BYTES.get(kind, 1) * number
+                if n_bytes > self.offset:
+                    begin = int.from_bytes(content, self.order)
+                    extents.append((begin, begin + n_bytes))
+            begins, counts = self.segments(entries)
+            extents += [(begin, begin + count) for begin, count in zip(begins, counts, strict=False)]
+        largest = end = 0
+        for begin, next_end in sorted(extents):
+            largest, end = max(largest, begin - end), max(end, next_end)
+        return largest
+
+    def segments(self, entries: Entries) -> tuple[list[int], list[int]]:
+        """Return the offsets and the numbers of bytes of a page's samples, by strips or tiles."""
+        codes = (
+            (Tag.TILE_OFFSETS, Tag.TILE_BYTES) if Tag.TILE_BYTES in entries else (Tag.STRIP_OFFSETS, Tag.STRIP_BYTES)
+        )
+        begins, counts = (self.numbers(entries, code) for code in codes)
+        return begins, counts
+
+    def numbers(self, entries: Entries, code: int) -> list[int]:
+        """Return the whole numbers of an entry, such as one for each strip."""
+        kind, number, content = entries.get(code, (3, 0, b""))
+        width = _VALUE_BYTES.get(kind, 1)
+        if width * number > self.offset:
+            self.file.seek(min(int.from_bytes(content, self.order), self.size))
+            content = self.file.read(min(width * number, self.size))
+        starts = range(0, min(number * width, len(content) - width + 1), width)
+        return [int.from_bytes(content[start : start + width], self.order) for start in starts]
 
     def page(self, offset: int) -> tuple[Entries, int] | None:
         """Read the entries of a page and the offset of the next one; None where the file ends before."""

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
-from rgbmidic.arguments import check_fields
+from rgbmidic.arguments import check_fields, checked
 from rgbmidic.disk import write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
@@ -67,11 +67,19 @@ class Calibration:
     name
         Name in messages: the file name.
     unevenness
-        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.frame_check.unevenness`).
+        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.histogram.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; not changed by reading.
     extra
         Sections of the file that this class does not interpret, kept when the file is written again.
+
+    Examples
+    --------
+    >>> calibration = Calibration.read("calibration.json")
+    >>> calibration.crosstalk.lights, calibration.kind
+    (('red', 'green', 'blue'), 'bayer')
+    >>> calibration.crosstalk.matrix.shape
+    (3, 3)
     """
 
     crosstalk: Crosstalk | None = None
@@ -171,6 +179,7 @@ class Calibration:
         )
 
     @classmethod
+    @checked
     def read(cls, path: Path | str) -> Calibration:
         """Read a calibration file.
 
@@ -196,6 +205,7 @@ class Calibration:
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
+    @checked
     def from_document(cls, document: dict[str, Any], name: str = "the calibration") -> Calibration:
         """Return the calibration of a JSON document.
 
@@ -363,7 +373,7 @@ class TargetLights:
             if self.crop_origin is None and full_shape is not None and shape != full_shape:
                 raise CalibrationError(
                     f"{self.calibration.name} was made with frames of {_size(full_shape)} px, the photograph has "
-                    f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
+                    f"{_size(shape)} px: state `crop_origin`, where it begins in the calibrated frame"
                 )
             registration = self.calibration.cropped(self.crop_origin, shape).registration
         elif self.crop_origin is not None and registration is not None:

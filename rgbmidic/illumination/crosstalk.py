@@ -11,7 +11,8 @@ From the spectra of lights and camera follows ``A[c, l] = sum over wavelengths o
 
 The lights are ``A^-1 channels`` at every pixel (`unmix`). Light j sees
 at x + rho_j(x) what the first light sees at x (`Registration`), in the reference and in the deformed state alike; the
-solve reads it there. Sampled there (`align`), its image shows every point where the first light's image shows it.
+solve reads it there. Sampled there (`IlluminationImages.on_first_light`), its image shows every point where the first
+light's image shows it.
 """
 
 from __future__ import annotations
@@ -22,15 +23,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.illumination import unmix as unmix_kernel
-from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.arguments import check_fields, checked
 from rgbmidic.errors import CalibrationError, InputError
-from rgbmidic.illumination.images import IlluminationImages, check_names, fill_holes
+from rgbmidic.illumination.images import IlluminationImages, check_names
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.settings import require_regular_file, unique_keys
 from rgbmidic.typing import BoolArray, FloatArray
@@ -493,6 +492,13 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     ------
     InputError
         The channels do not fit the crosstalk matrix.
+
+    Examples
+    --------
+    >>> channels = LinearChannels(values=np.full((3, 4, 5), 110.0), valid=np.full((3, 4, 5), True), full_scale=4095.0)
+    >>> crosstalk = Crosstalk(matrix=1.1 * np.eye(3), lights=("red", "green", "blue"))
+    >>> unmix(channels, crosstalk).values[:, 0, 0].round(3)
+    array([100., 100., 100.], dtype=float32)
     """
     colours = crosstalk.matrix.shape[0]
     if channels.values.ndim != 3 or len(channels.values) != colours or channels.valid.shape != channels.values.shape:
@@ -541,41 +547,3 @@ def required_channels(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> Boo
     ndarray, shape (k, C), bool
     """
     return np.asarray(np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True))
-
-
-def align(images: IlluminationImages) -> IlluminationImages:
-    """Warp every light to the first one's pixels by cubic B-spline interpolation.
-
-    Pixels whose neighbourhood of interpolation is invalid or outside the image become invalid.
-
-    Parameters
-    ----------
-    images
-        (k, H, W), each where its `registration` says.
-
-    Returns
-    -------
-    IlluminationImages
-        On the pixel grid of the first light, without a registration.
-    """
-    if (registration := images.registration) is None:
-        return images
-    height, width = images.shape
-    rows = 64  # warped at a time: their positions take less memory than an image
-    values, spline = images.values.copy(), np.empty((height + 2 * PAD, width + 2 * PAD), dtype=np.float32)
-    for light, image in enumerate(images.values):
-        bspline_coefficients(fill_holes(image), spline)
-        near_hole = cv2.dilate(np.isnan(image).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        for top in range(0, height, rows):
-            strip = values[light, top : top + rows]
-            y, x = np.mgrid[top : top + len(strip), :width].reshape(2, -1).astype(np.float64)
-            shift = registration.displacement(np.stack([x, y], axis=1) + images.origin)[light].T
-            if np.abs(shift).max() > 0.002:  # px: a fifth of the noise floor of DIC in good images, .01 px
-                x, y = x + shift[0], y + shift[1]
-                sampled = np.empty((3, x.size), dtype=np.float32)
-                sample_with_gradient(spline, x, y, *sampled)
-                inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-                row, column = (np.round(np.where(inside, at, 0)).astype(np.intp) for at in (y, x))
-                usable = inside & ~near_hole[row, column]
-                strip[:] = np.where(usable, sampled[0], np.float32(np.nan)).reshape(strip.shape)
-    return replace(images, values=values, valid=np.isfinite(values), registration=None)

@@ -7,7 +7,6 @@ docs/how-to/inspect.md shows which manipulations are found and that good frames 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any, get_args
 
@@ -17,66 +16,16 @@ import numpy.typing as npt
 from scipy.special import erf
 
 from rgbmidic.errors import ConfigurationError, FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic, colour_planes
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, refused, reported, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic.illumination.histogram import SIGNIFICANCE, unevenness
+from rgbmidic.illumination.plane_samples import Frame, PlaneSamples
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 
-Frame = Mosaic | ChannelFrame
-
 BLOCK = 16
 """Side of blocks in px, twice that for the greens."""
-SIGNIFICANCE = 6.0
-"""Standard errors beyond which a departure is not chance: 24 planes and levels are looked at."""
-WINDOW = 9
-"""Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
-SMOOTHED = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """The P colour planes of a frame in the rectangle of the region."""
-
-    names: tuple[str, ...]
-    stored: npt.NDArray[np.uint16]  # (P, h, w)
-    black: FloatArray  # (P,)
-    values: npt.NDArray[np.float32]  # DN above black
-    usable: BoolArray  # in the region, neither saturated nor cut off at 0
-    noise: tuple[NoiseModel | None, ...]
-    red_row: int  # of a cell of the pattern
-
-    @classmethod
-    def of(cls, frame: Frame, calibration: Calibration, inside: BoolArray, window: tuple[slice, slice]) -> _Samples:
-        """Cut the colour planes in a window out of the frame."""
-        step = 2 if isinstance(frame, Mosaic) else 1
-        names, planes, black = colour_planes(replace(frame, values=frame.values[..., *window]))
-        stored = np.stack(planes)
-        height, width = stored.shape[1:]
-        inner = inside[window][: step * height : step, : step * width : step]
-        noise = dict.fromkeys("RGBM", calibration.noise)
-        if (figures := calibration.camera_noise) is not None:  # of a colour, since cropping exchanges the greens
-            for colour in {name[0] for name in figures.planes}:
-                same = [index for index, name in enumerate(figures.planes) if name[0] == colour]
-                gain, read_noise = figures.gain.value[same].mean(), figures.read_noise.value[same].mean()
-                noise[colour] = NoiseModel(gain=float(gain), read_noise=float(read_noise))
-        return cls(
-            names=names,
-            stored=stored,
-            black=black,
-            values=stored.astype(np.float32) - black.astype(np.float32)[:, None, None],
-            usable=inner & (stored < frame.white_level) & (stored > 0),
-            noise=tuple(noise[name[0]] for name in names),
-            red_row=int("R" in frame.cfa[2:]) if isinstance(frame, Mosaic) else 0,
-        )
-
-    @property
-    def middle(self) -> tuple[slice, ...]:
-        """At most 288 x 288 samples in the middle, from even ones on: 4 planes of them are looked at in 30 ms."""
-        max_side = 288
-        return tuple(slice(max(side - max_side, 0) // 4 * 2, (side + max_side) // 2) for side in self.stored.shape[1:])
 
 
 def check_state(
@@ -128,7 +77,7 @@ def check_state(
         raise FrameError(
             f"{name} is not what was calibrated: {'; '.join(check.text for check in wrong)}. Take the calibration of "
             "this camera and these lights; if all this is meant to be, accept it: calibration.accept = "
-            f"[{names}] (rgbmidic inspect: --accept)"
+            f"[{names}] (`rgbmidic inspect --accept`)"
         )
     return checks
 
@@ -158,10 +107,10 @@ def contradictions(
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     top, left = int(rows[0]) // 2 * 2, int(columns[0]) // 2 * 2  # the pattern stays what it is
     window = slice(top, int(rows[-1]) + 1), slice(left, int(columns[-1]) + 1)
-    samples = _Samples.of(frame, calibration, inside, window)
+    samples = PlaneSamples.of(frame, calibration, inside, window)
     if min(samples.stored.shape[1:]) < 2 * BLOCK:
         return []
-    repeat_samples = None if repeat is None else _Samples.of(repeat, calibration, inside, window)
+    repeat_samples = None if repeat is None else PlaneSamples.of(repeat, calibration, inside, window)
     full_scale = frame.white_level - float(frame.black_level.mean())
     checks = list(_levels(samples, repeat_samples, calibration.unevenness, full_scale))
     if len(samples.names) == 4:
@@ -175,7 +124,7 @@ def contradictions(
 
 
 def _levels(
-    samples: _Samples, repeat_samples: _Samples | None, calibrated: float | None, full_scale: float
+    samples: PlaneSamples, repeat_samples: PlaneSamples | None, calibrated: float | None, full_scale: float
 ) -> Iterator[Check]:
     """Check the histogram of the grey levels for levels that are missing or doubled, and where none are, the noise.
 
@@ -203,76 +152,7 @@ def _levels(
         yield from _noise(samples, repeat_samples, step)
 
 
-def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> float | None:
-    """Find the level below white at which samples pile up as they do at saturation.
-
-    Parameters
-    ----------
-    samples
-        Raw samples.
-    white
-        Their white level.
-
-    Returns
-    -------
-    float or None
-        Their largest value, where it occurs more than twice as often as the four levels below it, which noise would
-        make as frequent; None: it does not. A constant piles up: a plane that is saturated as a whole.
-    """
-    top = int(samples.max(initial=0))
-    if top >= white or top < 8 or (count := np.count_nonzero(samples == top)) <= 20:
-        return None
-    bits = int(np.bitwise_or.reduce(samples, axis=None))
-    step = bits & -bits  # all samples are multiples of it
-    below = np.count_nonzero(samples >= top - 4 * step) - count
-    return float(top) if count > 2 * below else None
-
-
-def unevenness(
-    samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
-) -> float:
-    """Return the relative variance of the histogram of raw samples about its smooth course, less that of counting.
-
-    It is 0 where the histogram is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing,
-    about 2 where every other one is; NaN where too few samples, or too little noise, leave it open.
-
-    Parameters
-    ----------
-    samples
-        Of one colour plane, none saturated.
-    noise
-        Calibrated noise: only levels at which it smooths the histogram are looked at; None: all.
-    black
-        Their black level.
-    step
-        What all samples of the frame are multiples of.
-
-    Returns
-    -------
-    float
-    """
-    if samples.size < 1000:
-        return float("nan")
-    count = np.bincount(samples // step).astype(np.float64)
-    if count.size < 30:
-        return float("nan")
-    count[: np.flatnonzero(count)[0] + 1] = 0  # what is clipped at the bottom
-    smooth_count = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
-    usable = smooth_count >= 8
-    if noise is not None:
-        usable &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
-    if usable.sum() < 30:
-        return float("nan")
-    middle = np.linalg.pinv(np.vander(np.arange(WINDOW) - WINDOW // 2, 3))[-1]  # of the parabola through a window
-    residual_fraction = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
-    square = (count - np.convolve(count, middle, mode="same"))[usable] ** 2 / residual_fraction
-    chance = SIGNIFICANCE * np.sqrt(2 * usable.sum())
-    if (square / smooth_count[usable]).sum() - usable.sum() < chance:
-        return 0.0
-    return float((square.sum() - smooth_count[usable].sum()) / (smooth_count[usable] ** 2).sum())
-
-
-def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Check]:
+def _noise(samples: PlaneSamples, repeat: PlaneSamples | None, step: int) -> Iterator[Check]:
     """Check that the noise is on the photon transfer line of the calibration, at each grey level of each plane.
 
     Differences ``a - b - c + d`` of four neighbours in a plane hold four times the variance of a sample, and texture.
@@ -356,7 +236,7 @@ def _small_differences(plane: npt.NDArray[Any], step: int) -> FloatArray:
     return out
 
 
-def _differences(samples: _Samples) -> tuple[npt.NDArray[Any], ...]:
+def _differences(samples: PlaneSamples) -> tuple[npt.NDArray[Any], ...]:
     """Return differences of 2 x 2 samples, means, the predicted variance (P, h, w), and where to use them.
 
     Noise that a row or a column has in common is not in the differences. With as much of it as read noise the count of
@@ -382,12 +262,12 @@ def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:
     return np.asarray(means, dtype=np.float64)
 
 
-def _whole_blocks(samples: _Samples, side: int) -> BoolArray:
+def _whole_blocks(samples: PlaneSamples, side: int) -> BoolArray:
     """Return the blocks of `side` samples that are usable in all planes."""
     return np.asarray(_block_means(np.logical_and.reduce(samples.usable)[None].astype(np.float32), side)[0] == 1)
 
 
-def _greens(samples: _Samples) -> Iterator[Check]:
+def _greens(samples: PlaneSamples) -> Iterator[Check]:
     """Check that the greens agree from place to place as the other planes do: else the pattern has another phase.
 
     The greens of good scenes reach a rms of log(G1/G2) of .03 by the texture that each plane samples, the other two
@@ -406,7 +286,7 @@ def _greens(samples: _Samples) -> Iterator[Check]:
     yield Check("greens", text, greens, max(0.03, 1.5 * red_blue))
 
 
-def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: tuple[int, int]) -> Iterator[Check]:
+def _lights(samples: PlaneSamples, crosstalk: Crosstalk, full_scale: float, origin: tuple[int, int]) -> Iterator[Check]:
     """Check that no light is negative after unmixing, or shows a mirrored texture, on more than 1 % of the blocks.
 
     A contrast counts as mirrored below -.1 of the best light's: in one block of good scenes it is -.13. It needs one
@@ -447,7 +327,7 @@ the lens: 1.3 is what lamps that were not touched may drift and a target may be 
 greens of an ICX655 differ by in red light."""
 
 
-def _red_and_blue(samples: _Samples, crosstalk: Crosstalk) -> Iterator[Check]:
+def _red_and_blue(samples: PlaneSamples, crosstalk: Crosstalk) -> Iterator[Check]:
     """Check that red and blue are not exchanged, as by a window of the sensor that is moved by one row and one column.
 
     The greens in rows with red and those in rows with blue are exchanged, too: their difference, where it is
@@ -513,7 +393,7 @@ def _red_and_blue(samples: _Samples, crosstalk: Crosstalk) -> Iterator[Check]:
     yield warning(text.format(observation), max(better, 0.0), above=9.0)
 
 
-def _interpolated(samples: _Samples) -> Iterator[Check]:
+def _interpolated(samples: PlaneSamples) -> Iterator[Check]:
     """Check for samples interpolated from a mosaic: smoother along one axis, or at some places of a 2 x 2 cell.
 
     In a plane of a mosaic, interpolated by another phase of the pattern, mean square second over mean square first

@@ -233,6 +233,13 @@ class IlluminationImages:
         Column and row of the frame at which the images begin.
     registration : Registration or None
         Where in its own image a light shows what the first one shows at a pixel of the frame; None: at the same pixel.
+
+    Examples
+    --------
+    >>> values = np.full((2, 4, 5), 100.0)
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red", "blue"), full_scale=255.0)
+    >>> images.shape, images.valid.all()
+    ((4, 5), np.True_)
     """
 
     values: FloatImage
@@ -315,6 +322,51 @@ class IlluminationImages:
             self, origin=origin, registration=registration and registration.cropped((-origin[0], -origin[1]))
         )
 
+    def on_first_light(self) -> IlluminationImages:
+        """Resample every light onto the first one's pixels by cubic B-splines: for pictures, not for a correlation.
+
+        A correlation reads each light where its `registration` says, without resampling it. Pixels whose neighbourhood
+        of interpolation is invalid or outside the image become invalid.
+
+        Returns
+        -------
+        IlluminationImages
+            On the pixel grid of the first light, without a registration.
+
+        Examples
+        --------
+        >>> registration = Registration.identity(("red", "blue"), (4, 5))
+        >>> values = np.ones((2, 4, 5))
+        >>> images = IlluminationImages(
+        ...     values=values, valid=values > 0, names=("red", "blue"), full_scale=255, registration=registration
+        ... )
+        >>> images.on_first_light().registration is None
+        True
+        """
+        from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
+
+        if (registration := self.registration) is None:
+            return self
+        height, width = self.shape
+        rows = 64  # warped at a time: their positions take less memory than an image
+        values, spline = self.values.copy(), np.empty((height + 2 * PAD, width + 2 * PAD), dtype=np.float32)
+        for light, image in enumerate(self.values):
+            bspline_coefficients(fill_holes(image), spline)
+            near_hole = cv2.dilate(np.isnan(image).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            for top in range(0, height, rows):
+                strip = values[light, top : top + rows]
+                y, x = np.mgrid[top : top + len(strip), :width].reshape(2, -1).astype(np.float64)
+                shift = registration.displacement(np.stack([x, y], axis=1) + self.origin)[light].T
+                if np.abs(shift).max() > 0.002:  # px: a fifth of the noise floor of DIC in good images, .01 px
+                    x, y = x + shift[0], y + shift[1]
+                    sampled = np.empty((3, x.size), dtype=np.float32)
+                    sample_with_gradient(spline, x, y, *sampled)
+                    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+                    row, column = (np.round(np.where(inside, at, 0)).astype(np.intp) for at in (y, x))
+                    usable = inside & ~near_hole[row, column]
+                    strip[:] = np.where(usable, sampled[0], np.float32(np.nan)).reshape(strip.shape)
+        return replace(self, values=values, valid=np.isfinite(values), registration=None)
+
     def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
         """Return the fraction of a light that is not diffuse, from a single frame.
 
@@ -373,7 +425,9 @@ def without_dark_pixels(images: IlluminationImages, weights: FloatImage) -> Floa
     """
     threshold, out = DARK * images.full_scale, weights
     for light, image in enumerate(images.values):
-        reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(image, None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+        if not np.isfinite(reduced).all():
+            reduced = cv2.resize(np.nan_to_num(image), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
         if reduced.min() <= threshold:  # else no mean over a wider window is
             is_dark = ~(local_mean(image, _DARK_WINDOW) > threshold)
             out = weights.copy() if out is weights else out

@@ -29,6 +29,12 @@ class NoiseModel:
         Conversion gain in electrons per grey level (e-/DN).
     read_noise
         Standard deviation of the signal-independent noise in grey levels (DN).
+
+    Examples
+    --------
+    >>> noise = NoiseModel(gain=4.0, read_noise=3.0)
+    >>> noise.variance(np.array([400.0])).tolist()
+    [109.0]
     """
 
     gain: float = bounded(above=0)
@@ -54,6 +60,12 @@ class LinearMosaic:
         White level minus mean black level (DN).
     noise : NoiseModel or None
         Camera noise, where the calibration knows it.
+
+    Examples
+    --------
+    >>> mosaic = Mosaic(values=np.full((4, 6), 4095, dtype=np.uint16), cfa="RGGB", black_level=64, white_level=4095)
+    >>> linearise(mosaic).saturated.all()
+    np.True_
     """
 
     values: FloatImage
@@ -85,6 +97,12 @@ class LinearChannels:
         False where a saturated sample took part in the value.
     full_scale : float
         White level minus mean black level (DN).
+
+    Examples
+    --------
+    >>> channels = LinearChannels(values=np.ones((3, 4, 5)), valid=np.full((3, 4, 5), True), full_scale=4031.0)
+    >>> channels.values.shape
+    (3, 4, 5)
     """
 
     values: FloatImage
@@ -105,6 +123,13 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
     Returns
     -------
     LinearMosaic or LinearChannels
+
+    Examples
+    --------
+    >>> mosaic = Mosaic(values=np.full((4, 6), 564, dtype=np.uint16), cfa="RGGB", black_level=64, white_level=4095)
+    >>> linear = linearise(mosaic)
+    >>> linear.values[0, 0], linear.full_scale
+    (np.float32(500.0), 4031.0)
     """
     full_scale = frame.white_level - float(frame.black_level.mean())
     saturated = frame.values >= frame.white_level

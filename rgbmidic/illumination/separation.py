@@ -17,7 +17,7 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.crosstalk import Crosstalk, align, unmix
+from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import (
     SMALLEST_FRAME,
     Reconstruction,
@@ -41,11 +41,14 @@ DEMOSAICERS = (DEFAULT_METHOD, *_BY_CHANNEL)
 def separate(
     frame: Mosaic | ChannelFrame | LinearMosaic | LinearChannels,
     calibration: Calibration | Crosstalk,
-    method: str = DEFAULT_METHOD,
+    method: str = "auto",
     *,
     texture: TextureModel | None = None,
 ) -> IlluminationImages:
-    """One image per light from one raw colour frame: linearised, demosaiced, unmixed and, where calibrated, registered.
+    """Return one image per light from one raw colour frame, as a measurement uses them.
+
+    The frame is linearised, demosaiced and unmixed. No image is resampled: a calibrated registration comes with the
+    images, and `correlate` reads each light where it says. `IlluminationImages.on_first_light` resamples them.
 
     Parameters
     ----------
@@ -68,12 +71,23 @@ def separate(
     ------
     InputError
         Unknown method, a frame too small for it, no crosstalk, or one that is not for the frame's channels.
+
+    Examples
+    --------
+    >>> crosstalk = Crosstalk(matrix=[[1, 0.1, 0], [0.1, 1, 0.1], [0, 0.1, 1]], lights=("red", "green", "blue"))
+    >>> raw_values = np.full((16, 20), 564, dtype=np.uint16)
+    >>> frame = Mosaic(values=raw_values, cfa="RGGB", black_level=64, white_level=4095)
+    >>> images = separate(frame, crosstalk)
+    >>> images.names, images.shape
+    (('red', 'green', 'blue'), (16, 20))
+    >>> images.values[:, 8, 8].round()
+    array([459., 408., 459.], dtype=float32)
     """
     if isinstance(calibration, Crosstalk):
         calibration = Calibration(crosstalk=calibration)
     linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
     images = _separated(linear, calibration, method, texture, None)
-    return align(replace(images, registration=calibration.registration))
+    return replace(images, registration=calibration.registration)
 
 
 def _separated(
@@ -130,6 +144,12 @@ def demosaic(
     ------
     InputError
         Unknown method, or a frame too small for it.
+
+    Examples
+    --------
+    >>> mosaic = Mosaic(values=np.full((16, 20), 564, dtype=np.uint16), cfa="RGGB", black_level=64, white_level=4095)
+    >>> demosaic(mosaic, "malvar").values[:, 8, 8]
+    array([500., 500., 500.], dtype=float32)
     """
     linear = linearise(mosaic) if isinstance(mosaic, Mosaic) else mosaic
     if not isinstance(linear, LinearMosaic):
@@ -191,6 +211,16 @@ class LightSeparation(Protocol):
 
     - ``learnt(images)``: the separation of all other frames, which has the images of the reference's first frame;
     - ``describe()``: a text that says what it does; another text is another test, which `resume` refuses.
+
+    Examples
+    --------
+    >>> def first_channel(frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
+    ...     values = frames[0].values[:1].astype(float)
+    ...     return IlluminationImages(values=values, valid=values >= 0, names=("red",), full_scale=4095.0)
+    >>> separation: LightSeparation = first_channel
+    >>> frame = ChannelFrame(values=np.full((3, 4, 5), 9, dtype=np.uint16), black_level=np.zeros(3), white_level=4095.0)
+    >>> separation((frame,)).values.shape
+    (1, 4, 5)
     """
 
     def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...], /) -> IlluminationImages:
@@ -234,6 +264,12 @@ class Separation:
         The speckle's autocorrelation, shared by all frames of a test; None: each frame tells its own.
     tables
         The filters that its frames have needed so far.
+
+    Examples
+    --------
+    >>> frame = ChannelFrame(values=np.full((1, 4, 5), 9, dtype=np.uint16), black_level=np.ones(1), white_level=4095.0)
+    >>> Separation()((frame,)).values[0, 0, 0]
+    np.float32(8.0)
     """
 
     calibration: Calibration | None = None

@@ -382,6 +382,13 @@ def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float 
     ------
     InputError
         It is no picture, or the width is not positive.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> picture = gaussian_filter(np.random.default_rng(0).normal(size=(128, 128)), 2)
+    >>> 6 < speckle_diameter(picture) < 7.5
+    True
     """
     if picture.ndim != 2 or min(picture.shape) < 2 or not 0 < background < 1e6:
         raise InputError(f"a picture (H, W) and a width above 0 px are needed, not {picture.shape}, {background:g}")

@@ -40,8 +40,7 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
     existing = [name for name in files if (out / name).exists()]
     if existing and not overwrite:
         raise ResultError(
-            f"{out / existing[0]} is already there; choose another folder, or overwrite it (overwrite=True, "
-            "--overwrite)"
+            f"{out / existing[0]} is already there; choose another folder, or overwrite it (`overwrite=True`)"
         )
 
 

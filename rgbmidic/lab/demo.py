@@ -25,7 +25,6 @@ from rgbmidic.fields import CameraCalibration, at_nodes, field_rms
 from rgbmidic.fields.plane import undistorted
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.crosstalk import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.pipeline.resolution import rms
@@ -152,7 +151,7 @@ def run_demo(
 
     test, scene = out / "test", out / "scene.toml"
     if out.exists() and any(out.iterdir()):
-        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder (--out)")
+        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder (`out`)")
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
@@ -176,7 +175,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     assert settings.calibration.file is not None
     calibration = Calibration.read(settings.calibration.file)
     separation, frames = Separation(calibration=calibration), open_series(settings.frames, settings.base, calibration)
-    images = [align(separation(frames.read(index))).values for index in range(len(frames))]
+    images = [separation(frames.read(index)).on_first_light().values for index in range(len(frames))]
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
         "element_size": settings.mesh.element_size,
@@ -340,7 +339,7 @@ def _separate() -> None:
     from rgbmidic.lab.virtual.rendering import sphere_scene
     from rgbmidic.scene.scene import DatasetSettings
 
-    scene, settings = sphere_scene(size=_SIZE), DatasetSettings()
+    scene, settings = sphere_scene(size=_SIZE, lateral_colour=0.5), DatasetSettings()
     with tempfile.TemporaryDirectory() as folder:
         for index in range(2):
             frame = record(_images(index), scene.camera, scene.lights, seed=index)

@@ -134,7 +134,7 @@ def out_of_plane_error(plan: LampPlan, distance: float | None = None) -> dict[st
     """
     distance = plan.scene.body.front[2] if distance is None else distance
     if not (distance > 0 and math.isfinite(distance)):
-        raise InputError(f"--distance, from camera to specimen, must be positive and finite, not {distance:g} mm")
+        raise InputError(f"`distance`, from camera to specimen, must be positive and finite, not {distance:g} mm")
     x0, y0, x1, y1 = plan.field
     x, y = plan.scene.camera.centre
     edge = math.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y)) / distance

@@ -75,6 +75,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     >>> mesh = read_mesh("plate.inp")
     >>> mesh.element_numbers.tolist(), mesh.areas.tolist()
     ([7], [50.0])
+    >>> Path("plate.inp").unlink()
     """
     path = Path(path)
     if unit not in LENGTH_UNITS:
@@ -91,7 +92,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
         message = str(error) if isinstance(error, OSError) else str(error)[:120]  # the latter may quote the file
         raise InputError(f"{path} is not a readable mesh: {message or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
-    axes, selected = _plane(content.points, faces, path)
+    axes, selected = _select_plane(content.points, faces, path)
     corners, numbers = _triangles(content.points[:, axes], faces[selected], numbers[selected], path)
     used_nodes, index = np.unique(corners, return_inverse=True)
     mesh = FiniteElementMesh(
@@ -148,7 +149,7 @@ def _faces(content: MeshContent, path: Path, element_set: str | None) -> tuple[I
     return faces[free], numbers[free]
 
 
-def _plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, int], IntArray]:
+def _select_plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, int], IntArray]:
     """Return the axes of the plane that is measured, and its faces; the log states which, if there are others."""
     corners, nodes = points[faces], points[np.unique(faces)]
     area = np.linalg.norm(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]), axis=1) / 2

@@ -40,6 +40,14 @@ class PixelMap:
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     lines : ndarray, shape (R, 4), int32
         First slot, number of pixels, row and column in `bounds` of every run.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region, element_size=20), region)
+    >>> pixels.offsets[-1] == region.mask.sum()
+    np.True_
     """
 
     offsets: npt.NDArray[np.int64]
@@ -192,24 +200,28 @@ class PixelMap:
         block_sums(values, self.lines, self.run_offsets, side, out)
         return out
 
-    def weighted_block_sums(self, values: FloatImage, weight: FloatImage, side: int) -> FloatArray:
-        """Sum `values` (n, P) times a `weight` (P,) over such blocks, shape (n, rows, columns).
+    def weighted_block_sums(
+        self, values: FloatImage, weight: FloatImage, side: int, *, with_weight: bool = False
+    ) -> FloatArray:
+        """Sum `values` (P,) times a `weight` (P,) over such blocks, and the weight too where asked for.
 
         Parameters
         ----------
-        values : ndarray, shape (n, P), float32
-            Fields at the owned pixels.
+        values : ndarray, shape (P,), float32
+            A field at the owned pixels.
         weight : ndarray, shape (P,), float32
-            Their weight.
+            Its weight.
         side
             Side of the blocks in px.
+        with_weight
+            Whether the sums of the weight are returned, too.
 
         Returns
         -------
-        ndarray, shape (n, rows, columns), float64
+        ndarray, shape (1 or 2, rows, columns), float64
         """
-        out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
-        weighted_block_sums(values, weight, self.lines, self.run_offsets, self.offsets, side, out)
+        out = np.empty((1 + with_weight, *self.grid(side)), dtype=np.float32)
+        weighted_block_sums(values, weight, self.lines, self.run_offsets, side, out)
         return out.astype(np.float64)
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:

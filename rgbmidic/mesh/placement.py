@@ -14,6 +14,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import FiniteElementMesh
 from rgbmidic.mesh.region import Region
@@ -260,6 +261,7 @@ class Placement:
         return {name: getattr(self, name).tolist() for name in ("matrix", "shift", "pairs")}
 
     @classmethod
+    @checked
     def from_document(cls, document: Mapping[str, Any], camera: Plane | None = None) -> Self:
         """Return the placement of such values, and the `camera` that it was fitted with.
 

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
-from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, common_variance_fraction
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_test, read_toml, require_regular_file
+from rgbmidic.typing import ProgressCallback
 
 logger = logging.getLogger(__name__)
 
@@ -162,7 +162,7 @@ def run_batch(
     elastic: tuple[float, float] = ELASTIC,
     overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Iterator[Outcome]:
     """Measure tests one after the other, each into a folder of its name; yield what each gave as it ends.
 
@@ -200,7 +200,12 @@ def run_batch(
 
 
 def _measured(
-    read: Callable[[], TestSettings], folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
+    read: Callable[[], TestSettings],
+    folder: Path,
+    workers: int | None,
+    progress: ProgressCallback | None,
+    *,
+    overwrite: bool,
 ) -> tuple[Result, TestSettings, bool]:
     """Measure a test unless it is measured already; whether it was measured now comes last."""
     settings, has_run = read(), False
@@ -216,7 +221,7 @@ def _measured(
     except AnotherTestError as error:
         reason = str(error).rpartition("; ")[0]
         if not overwrite:
-            raise ResultError(f"{reason}; --overwrite measures it again") from None
+            raise ResultError(f"{reason}; `overwrite=True` measures it again") from None
         logger.warning("%s is measured again: %s", folder.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
     return result, settings, has_run

@@ -23,7 +23,8 @@ from rgbmidic.correlation import NodeStatus, Status, TrackingState
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
-from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
+from rgbmidic.pipeline.order import STRIDE, is_key, parent
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.warnings import collect_messages
 
@@ -131,7 +132,7 @@ class Schedule:
     def _take(self, position: int, start: TrackingState, outcome: FrameOutcome) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
         if outcome.record.unread and (gone := self._plan.series.missing_lights()):
-            raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
+            raise FrameError(f"the frames are gone: {gone}; go on with `resume=True` when they are there again")
         first = self._first_tries.pop(position, None)
         lost = outcome.record.status != Status.CONVERGED or rank_of(outcome.record)[1] > start.unmeasured + 0.01
         if first is None and is_key(position) and lost:  # a hundredth of the nodes more than where it started from
@@ -253,7 +254,9 @@ class Cluster:
                 log.setLevel(level)
 
 
-LOST_CLUSTER = "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with --resume"
+LOST_CLUSTER = (
+    "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with `resume=True`"
+)
 
 
 @contextmanager

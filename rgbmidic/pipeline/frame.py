@@ -41,7 +41,8 @@ from rgbmidic.pipeline.frame_quality import (
     too_small,
     unsteady,
 )
-from rgbmidic.pipeline.plan import STRIDE, Plan, parent
+from rgbmidic.pipeline.order import STRIDE, parent
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage
@@ -96,6 +97,17 @@ def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Referen
     Returns
     -------
     FrameRecord
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic.settings import TestSettings
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> frames, region = {"path": [], "kind": "monochrome"}, {"rectangle": [0, 0, 79, 79]}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": region})
+    >>> plan = Plan.from_settings(settings, source=np.stack([speckle, np.roll(speckle, 1, axis=1)]))
+    >>> measure_frame(plan, 1, TrackingState(displacement=None)).status
+    0
     """
     return measure_frame_safely(plan, index, start, updated).record
 

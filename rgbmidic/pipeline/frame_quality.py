@@ -17,7 +17,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.displacement import LightDisplacement
-from rgbmidic.illumination.frame_check import saturation_pile
+from rgbmidic.illumination.histogram import saturation_pile
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.mosaic_model import BLOCK

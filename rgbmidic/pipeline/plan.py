@@ -1,20 +1,14 @@
-"""What all frames of a test share, made once before the first is measured, and which frame each of them starts from.
+"""What all frames of a test share, made once before the first is measured.
 
 calibration -> series of frames -> reference frames, checked -> one image per light, averaged -> region and mesh ->
 weights -> reference of the solve.
-
-The frames are the leaves of a tree of base `STRIDE`, whatever the number of workers: a frame starts from the one before
-it, every 16th from the 16th before, every 256th from the 256th before, and so on, so that chunks of consecutive frames
-can be measured side by side once their key frame is, and any range of frames needs only some key frames of those before
-it. A key frame that is not measured well from there is measured once more from the frame just before it, and the better
-of both is kept (`rgbmidic.pipeline.engine`).
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from threading import Lock
@@ -53,8 +47,6 @@ from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
 
-STRIDE = 16
-"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 
@@ -129,6 +121,16 @@ class Plan:
         Whether to tell the time that each stage of a frame takes.
     process
         What the threads of a process share.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(2, 80, 80)), (0, 1.5, 1.5))
+    >>> frames, region = {"path": [], "kind": "monochrome"}, {"rectangle": [0, 0, 79, 79]}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": region})
+    >>> plan = Plan.from_settings(settings, source=speckle)
+    >>> plan.images.shape, plan.reference.mesh.nodes.shape[1]
+    ((80, 80), 2)
     """
 
     settings: TestSettings
@@ -500,30 +502,3 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
         except RegionError as error:
             raise RegionError(f"region.mask {settings.mask}: {error}") from None
     return outlined.without(settings.holes)
-
-
-def parent(position: int) -> int | None:
-    """The frame that a frame starts from; None for the first."""
-    if position == 0:
-        return None
-    step = 1
-    while position % (step * STRIDE) == 0:
-        step *= STRIDE
-    return position - step
-
-
-def is_key(position: int) -> bool:
-    """Return whether a frame starts from one that is not just before it."""
-    return position > 0 and position % STRIDE == 0
-
-
-def dependants(positions: Iterable[int], tries: Sequence[int]) -> set[int]:
-    """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
-
-    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
-    """
-    affected = set(positions)
-    for position, try_count in enumerate(tries):
-        if parent(position) in affected or (try_count > 1 and position - 1 in affected):
-            affected.add(position)
-    return affected

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,22 +20,18 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionEr
 from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.tri3 import refine_elements
 from rgbmidic.pipeline.frame import prepared_frame
 from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
 
 SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)
 """Element sizes (px) that are tried where none are stated: the default (the paper's) and steps of 1.6, which change the
 noise by as much and the discretisation error of a smooth field by 4 (its third power)."""
-
-
-Progress = Callable[[int, int, str], None]
 
 
 def sizes_to_try(plan: Plan, requested: Sequence[float] = ()) -> tuple[float, ...]:
@@ -74,7 +70,7 @@ def study_sizes(
     gauges: Sequence[float] | None = None,
     frames: Sequence[int] = (),
     static: bool = True,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     **objects: Any,
 ) -> ResolutionStudy:
     """Measure a deformed frame and the static frames of a test with elements of several sizes.
@@ -125,7 +121,7 @@ def study_sizes(
         )
     report = progress or (lambda done, total, line: None)
     report(0, len(sizes) + 1, "looking for the key frame")
-    key = _KeyFrame.find(plan, frames)
+    key = KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[: CONSTANTS.static] if static and len(settings.frames.reference) > 1 else ()
     static_frames = [_deformed(plan, index) for index in at_rest]
     figures, finer = [], list[tuple[Tri3Mesh, Solution]]()
@@ -277,73 +273,8 @@ def choose(settings: TestSettings, **objects: Any) -> Choice:
     return choice
 
 
-def refine(plan: Plan, frame: int | bool = True) -> Plan:
-    """Bisect the elements whose discretisation error of strain in a deformed frame is more than twice its noise.
-
-    It is done three times at most, in one frame, for the mesh of the whole test. No leg gets shorter than three
-    speckles; both sides of a crack are bisected alike.
-
-    Parameters
-    ----------
-    plan
-        The test with elements of one size.
-    frame
-        Index of the frame; True: of five of the test, evenly spread, the one that departs most from an affine motion.
-
-    Returns
-    -------
-    Plan
-        With the finer mesh, and a note that tells of it.
-
-    Raises
-    ------
-    RgbmidicError
-        There is no such deformed frame, or none can be measured.
-    """
-    try:
-        key = _KeyFrame.find(plan, () if frame is True else (int(frame),))
-    except (FrameError, InputError) as error:
-        raise type(error)(f"mesh.refine: {error}") from error
-    min_leg, counts = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.min_size), [len(plan.reference.mesh.nodes)]
-    while len(counts) <= CONSTANTS.passes:
-        mesh = plan.reference.mesh
-        solution = solved(plan, key.deformed, key.start(mesh))
-        estimated = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
-        missed, noise = (  # the squares at the corners of each element; NaN takes no part
-            np.nan_to_num(values[mesh.elements] ** 2).sum(axis=(1, 2))
-            for values in (estimated.strain_error, estimated.strain_std)
-        )
-        unresolved = missed > CONSTANTS.worth**2 * noise
-        finer = refine_elements(mesh, unresolved, min_leg)
-        if finer is mesh:
-            if unresolved.any():
-                worst = int(np.argmax(np.where(unresolved, missed, 0)))
-                logger.warning(
-                    "mesh.refine: strain is not resolved in %.2g %% of the region, least around (%.0f, %.0f): its "
-                    "discretisation error is %.2g there, its noise %.2g, and its parts would have legs under %.3g px",
-                    *(
-                        100 * mesh.areas[unresolved].sum() / mesh.areas.sum(),
-                        *mesh.nodes[mesh.elements[worst]].mean(axis=0),
-                    ),
-                    *(np.sqrt(values[worst] / 9) for values in (missed, noise)),  # three strains at three corners
-                    min_leg,
-                )
-            break
-        nodes = np.round(finer.nodes / CONSTANTS.exact) * CONSTANTS.exact
-        plan = plan.on_mesh(Tri3Mesh(nodes=nodes, elements=finer.elements))
-        counts.append(len(nodes))
-    name = plan.series.name(key.index)
-    worth = f"the discretisation error of strain in {name} is more than {CONSTANTS.worth:g} times its noise"
-    text = f"no element: there is none where {worth} and parts would have legs of {min_leg:.3g} px or more"
-    if counts[1:]:
-        text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
-        text += f"than {min_leg:.3g} px"
-    logger.info("refined: %s", text)
-    return replace(plan, notes={**plan.notes, "refinement": text})
-
-
 @dataclass(frozen=True, slots=True)
-class _KeyFrame:
+class KeyFrame:
     """The deformed frame that sizes are compared in, measured on the mesh of a plan."""
 
     index: int
@@ -353,7 +284,7 @@ class _KeyFrame:
     seconds: float
 
     @classmethod
-    def find(cls, plan: Plan, frames: Sequence[int]) -> _KeyFrame:
+    def find(cls, plan: Plan, frames: Sequence[int]) -> KeyFrame:
         """Measure some frames, and keep the one whose displacement departs most from an affine one."""
         selected, reference = plan.series.selected, plan.settings.frames.reference
         for index in frames:

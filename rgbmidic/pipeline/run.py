@@ -20,8 +20,10 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
-from rgbmidic.pipeline.plan import Plan, dependants
-from rgbmidic.pipeline.resolution import Progress, choose, refine
+from rgbmidic.pipeline.order import dependants
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.refinement import refine
+from rgbmidic.pipeline.resolution import choose
 from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.user_objects import check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
@@ -30,6 +32,7 @@ from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.result import list_frames, read_shared
 from rgbmidic.results.warnings import collect_messages, join_frame_warnings
 from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.typing import ProgressCallback
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
@@ -57,7 +60,7 @@ def measure(
     workers: int | None = None,
     scheduler: str | None = None,
     timings: bool = False,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Result:
     """Measure a test: displacement of every frame relative to the reference.
 
@@ -114,9 +117,24 @@ def measure(
     RgbmidicError
         The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
         or `out` contains the result of another test.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> stack = np.stack([np.roll(speckle, frame, axis=1) for frame in range(2)])
+    >>> frames, region = {"path": [], "kind": "monochrome"}, {"rectangle": [0, 0, 79, 79]}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": region, "mesh": {"element_size": 40}})
+    >>> with TemporaryDirectory() as folder:
+    ...     result = measure(settings, Path(folder) / "result", source=stack, workers=1)
+    ...     round(float(np.nanmedian(result.u[1])), 2)
+    1.0
     """
     if retry_failed and not resume:
-        raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
+        raise InputError("`retry_failed` goes with `resume`: it measures failed frames of a result again")
     if isinstance(settings, str | Path):
         settings = read_test(settings)
     check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
@@ -126,11 +144,11 @@ def measure(
     check_object("progress", progress, "__call__")
     instances: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     instances |= {} if region is None else {"region": region}
-    is_begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
-    provenance = read_provenance(Path(out)) if is_begun else {}
-    with collect_messages() as before:
+    has_provenance = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
+    provenance = read_provenance(Path(out)) if has_provenance else {}
+    with collect_messages() as plan_messages:
         plan = replace(_plan_of(settings, instances, provenance, Path(out)), timings=timings)
-    warnings = list(dict.fromkeys(text for level, text in before if level >= logging.WARNING))
+    warnings = list(dict.fromkeys(text for level, text in plan_messages if level >= logging.WARNING))
     plan = replace(plan, notes={**plan.notes, "warnings": warnings})
     objects = {
         name: describe(instance) for name, instance in instances.items() if instance is not None and name != "source"
@@ -142,12 +160,12 @@ def measure(
         workers = threads() if separation is None and weights is None else 1
     origin = _origin(plan, objects, provenance.get("unread_files", ()))
     if frames is not None:
-        opened = ResultStore.join(out, origin, frames=positions)
+        writable_store = ResultStore.join(out, origin, frames=positions)
     elif resume:
-        opened = ResultStore.resume(out, origin)
+        writable_store = ResultStore.resume(out, origin)
     else:
-        opened = ResultStore.create(out, origin, overwrite=overwrite)
-    with opened as store:
+        writable_store = ResultStore.create(out, origin, overwrite=overwrite)
+    with writable_store as store:
         if resume and frames is None:
             _invalidate_frames(plan, store, origin.names, retry_failed=retry_failed)
         sink = _ResultSink(plan, store, positions, progress)
@@ -163,10 +181,10 @@ def measure(
         texts = ((position, messages(record)) for position, record in zip(positions, table, strict=True))
         for line in join_frame_warnings(texts, origin.names):
             logger.warning("%s", line)
-        with collect_messages() as collected:
+        with collect_messages() as frame_messages:
             _warn_duplicate_frames(plan, store, positions, origin.names)
         if frames is None:
-            store.finish([text for _, text in collected])
+            store.finish([text for _, text in frame_messages])
     return Result.open(out, partial=frames is not None, check=False)
 
 
@@ -192,7 +210,7 @@ def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: M
 class _ResultSink:
     """The sink of a result folder."""
 
-    def __init__(self, plan: Plan, store: ResultStore, positions: range, progress: Progress | None) -> None:
+    def __init__(self, plan: Plan, store: ResultStore, positions: range, progress: ProgressCallback | None) -> None:
         self._plan, self._store, self._positions, self._progress = plan, store, positions, progress
         self._finished = store.finished()
 
@@ -309,8 +327,7 @@ def _select_positions(selected: range, frames: range | None) -> range:
     positions = [position for position, index in enumerate(selected) if frames is None or index in frames]
     if frames is not None and (not positions or frames.stop > selected[-1] + 1):
         raise FrameError(
-            f"--frames names {frames.start} to {frames.stop - 1}; the test has the frames {selected[0]} to "
-            f"{selected[-1]}"
+            f"`frames` are {frames.start} to {frames.stop - 1}; the test has the frames {selected[0]} to {selected[-1]}"
         )
     return range(positions[0], positions[-1] + 1)
 

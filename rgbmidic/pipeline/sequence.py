@@ -36,7 +36,8 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
 from rgbmidic.pipeline.frame import FrameOutcome, messages, next_reference
-from rgbmidic.pipeline.plan import STRIDE, Plan
+from rgbmidic.pipeline.order import STRIDE
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.user_objects import check_object, check_type
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
@@ -244,6 +245,15 @@ def measure_sequence(
     ------
     RgbmidicError
         The settings contradict themselves or the objects, or the reference is not usable.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 1.5)
+    >>> states = (np.roll(speckle, frame, axis=1) for frame in range(3))
+    >>> solutions = measure_sequence(states, element_size=40)
+    >>> [round(float(np.nanmedian(solution.displacement[:, 0])), 2) for solution in solutions]
+    [0.0, 1.0, 2.0]
     """
     check_type("settings", settings, TestSettings | None, "a TestSettings")
     if not np.iterable(states):

@@ -43,6 +43,12 @@ class FrameSequence(Protocol):
 
     It is read by one thread at a time. A Dask cluster sends it to other processes: it must then be picklable, and one
     that holds an open file opens it where it is used.
+
+    Examples
+    --------
+    >>> stack: FrameSequence = np.zeros((3, 40, 60))
+    >>> len(stack), stack[0].shape
+    (3, (40, 60))
     """
 
     def __len__(self) -> int:

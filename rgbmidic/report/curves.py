@@ -212,6 +212,15 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, max_ki
     -------
     Figure
         The figure, which `save_figure` writes.
+
+    Examples
+    --------
+    >>> from rgbmidic import Result, read_histories
+    >>> from rgbmidic.settings import ProbeSettings
+    >>> result = Result.open("my_result")
+    >>> histories = read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),)))
+    >>> len(history_figure(histories).axes)
+    1
     """
     panels = panels or history_panels(histories)
     kinds = sum(bool(label) for label, _ in panels)
@@ -293,6 +302,13 @@ def profile_figure(profile: Profile, wave: Wave | None = None, curve_rows: Seque
     -------
     Figure
         The figure.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Maps, Result, read_profile
+    >>> profile = read_profile(Maps.from_result(Result.open("my_result")), "u", (100, 150, 200, 150))
+    >>> len(profile_figure(profile).axes)
+    2
     """
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
@@ -390,6 +406,14 @@ class Curve:
     values : ndarray, shape (n,)
     has_times
         Whether `times` are seconds.
+
+    Examples
+    --------
+    >>> np.savetxt("force.csv", [[0, 0], [0.1, 20]], delimiter=",", header="time_s,force_N", comments="")
+    >>> curve = Curve.read("force.csv")
+    >>> curve.name, curve.values.tolist()
+    ('force_N', [0.0, 20.0])
+    >>> Path("force.csv").unlink()
     """
 
     name: str

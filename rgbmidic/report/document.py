@@ -112,6 +112,12 @@ def write_report(
         There is no such frame, or the file is named as something else than HTML.
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_report(Result.open("my_result"), f"{folder}/report.html", frames=[1])
     """
     out = Path(out)
     if out.suffix.lower() not in (".html", ".htm"):
@@ -225,6 +231,12 @@ def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path:
         Of the table; the fourth column is a test's folder.
     path
         HTML file to write.
+
+    Examples
+    --------
+    >>> write_batch_page(["test", "status", "reason", "folder"], [["a", "measured", "", "a"]], Path("batch.html"))
+    >>> Path("batch.html").read_text(encoding="utf-8")[:15], Path("batch.html").unlink()
+    ('<!doctype html>', None)
     """
     links = []
     for _, _, _, folder, *_ in rows:

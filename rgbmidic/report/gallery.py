@@ -78,6 +78,16 @@ def write_figures(
         There is no such frame.
     ResultError
         The result is damaged, the folder cannot be written, or a process that draws is ended.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> with TemporaryDirectory() as folder:
+    ...     pictures = write_figures(maps, folder, frames=[])
+    >>> pictures[0].name
+    'convergence.png'
     """
     folder, result = Path(folder), maps.result
     with write_errors(folder):
@@ -135,6 +145,15 @@ def write_maps(
         There is no such field or frame, or rates need more frames.
     ResultError
         The result is damaged, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> with TemporaryDirectory() as folder:
+    ...     [picture.name for picture in write_maps(maps, ["u"], folder, frames=[1])]
+    ['map_u_000001.png']
     """
     folder, drawer = Path(folder), MapDrawer(maps, style.DPI)
     frame_indices = _default_frames(maps.result) if frames is None else frames
@@ -182,6 +201,16 @@ def remove_pictures(folder: Path | str) -> None:
     ------
     ResultError
         One of them cannot be removed.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     report = Path(folder) / "report.html"
+    ...     report.touch()
+    ...     remove_pictures(folder)
+    ...     report.exists()
+    False
     """
     figure_files = [file for file in (Path(folder) / "figures").glob("*.png") if _NAMES.fullmatch(file.name)]
     for file in (*figure_files, Path(folder) / REPORT):

@@ -119,6 +119,14 @@ class FieldMovie:
     ------
     InputError
         A field, a frame, the limits or a number is none of those allowed.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> movie = FieldMovie(maps=maps, fields=("u", "exx"), limits={"u": (-1.0, 1.0)})
+    >>> movie.stated_limits
+    {'u': (-1.0, 1.0)}
     """
 
     maps: Maps
@@ -242,6 +250,15 @@ def write_movie(
         The ending or the number of frames per second is none of those allowed, or nothing is measured.
     ResultError
         The result is damaged, or the file cannot be written.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> movie = FieldMovie(maps=maps, fields=("u",), frames=[1], width=320)
+    >>> path = write_movie(movie, "u.gif", overwrite=True)
+    >>> path.name, path.unlink()
+    ('u.gif', None)
     """
     out = Path(out)
     ending = out.suffix.lower()

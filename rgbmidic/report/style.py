@@ -275,6 +275,13 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:
         There is no such format.
     ResultError
         The file cannot be written.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> figure = Figure()
+    >>> save_figure(figure, "empty.png", dpi=10)
+    >>> Path("empty.png").unlink()
     """
     path = Path(path)
     extension, formats = path.suffix[1:], figure.canvas.get_supported_filetypes()
@@ -468,6 +475,16 @@ def finish_plot(axis: Axes, x: str, y: str, *, integer_ticks: bool = True) -> No
         Labels.
     integer_ticks
         Whether the numbers along x are whole.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> figure = Figure()
+    >>> axis = figure.subplots()
+    >>> _ = axis.plot([0, 1, 2], [0.0, 0.1, 0.3])
+    >>> finish_plot(axis, "frame", "u in px")
+    >>> axis.get_ylabel()
+    'u in px'
     """
     from matplotlib.ticker import ScalarFormatter
 

@@ -10,7 +10,8 @@ from rgbmidic.results.histories import Histories, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.records import FrameRecord
 from rgbmidic.results.result import Result, finish_result
 from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, placement_of

@@ -44,6 +44,14 @@ class Channels:
         Name of each channel to its values (n,).
     offset
         Seconds that were added to the recorded times to make them those of the frames.
+
+    Examples
+    --------
+    >>> np.savetxt("force.csv", [[0, 0], [0.1, 20]], delimiter=",", header="time_s,force_N", comments="")
+    >>> channels = Channels.read("force.csv", offset=0.1)
+    >>> channels.interpolate(np.array([0.15]))
+    {'force_N': array([10.])}
+    >>> Path("force.csv").unlink()
     """
 
     path: Path
@@ -235,7 +243,7 @@ class Channels:
         if not ((times >= start) & (times <= end)).any():
             raise InputError(
                 f"the channels {self.path} span {start:.9g} to {end:.9g} s (offset {self.offset:g} s included), the "
-                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (--offset) between "
+                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (`offset`) between "
                 "both clocks"
             )
         return {name: np.interp(times, self.times, values, np.nan, np.nan) for name, values in self.values.items()}

@@ -184,6 +184,22 @@ class Comparison:
     InputError
         The simulation covers none of the measurement, or none of its times; a frame that is asked for is not measured
         or beyond its times.
+
+    Examples
+    --------
+    >>> from rgbmidic.mesh import FiniteElementMesh
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 8], [0, 8]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> simulation = Simulation(mesh=mesh, displacement=np.zeros((1, 4, 2)))
+    >>> placement = Placement.fit([(0, 0, 80, 240), (10, 0, 240, 240)])
+    >>> comparison = Comparison(Result.open("my_result"), simulation, placement, frames=[1])
+    >>> comparison.frame(1).agreement["nodes", "displacement"].values > 0
+    True
     """
 
     def __init__(
@@ -453,7 +469,13 @@ class Comparison:
 
 
 def measured_mesh(result: Result) -> FiniteElementMesh | None:
-    """Return the part of ``mesh.file`` that a result was measured on; None where it has none."""
+    """Return the part of ``mesh.file`` that a result was measured on; None where it has none.
+
+    Examples
+    --------
+    >>> measured_mesh(Result.open("my_result")) is None  # its mesh is of no file
+    True
+    """
     if result.node_number is None or result.element_number is None or result.node_mm is None:
         return None
     document = result.provenance["finite_elements"]
@@ -473,7 +495,7 @@ def _match_times(
     """Find the time (T,) of each frame, the frames to compare, and those beyond the simulation's times."""
     for index in requested or ():
         if result.frame(index).status == FAILED:
-            raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
+            raise InputError(f"frame {index} of {result.path} is not measured; compare another one (`frames`)")
         if index not in result.deformed:
             raise InputError(f"frame {index} of {result.path} is of the reference, against which nothing has moved")
     measured_frames = [index for index in result.deformed if result.finished[index] and result.status[index] != FAILED]
@@ -496,7 +518,7 @@ def _match_times(
             subject = f"frame {frames_outside[0]} is at {clock[frames_outside[0]]:.9g}"
         raise InputError(
             f"{subject} {unit}, the simulation {simulation.name} spans {start:.9g} to {end:.9g}: state the "
-            "--offset between both clocks, or other --frames"
+            "`offset` between both clocks, or other `frames`"
         )
     return np.clip(clock, start, end), tuple(frames_inside), frames_outside
 

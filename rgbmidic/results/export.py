@@ -26,7 +26,8 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
-from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
@@ -313,7 +314,7 @@ def _write_nodemaps(physical: ResultInUnits, folder: Path, *, overwrite: bool) -
     if physical.units.mm_per_pixel is None:
         raise InputError(
             f"nodemaps for CrackPy are in mm, and lengths of {result.path} are in px: state mm_per_pixel or camera in "
-            '[scale] of a TEST.toml, without unit = "px", and give it as --test'
+            '[scale], without unit = "px" (`scale`)'
         )
     stem = result.path.resolve().name
     if folder.exists() and not folder.is_dir():
@@ -324,7 +325,7 @@ def _write_nodemaps(physical: ResultInUnits, folder: Path, *, overwrite: bool) -
         if foreign_files or (present_files and not overwrite):
             raise ResultError(
                 f"{(foreign_files or present_files)[0]} is already there; nodemaps need a folder of their own"
-                + ("" if foreign_files else ", or overwrite them (overwrite=True, --overwrite)")
+                + ("" if foreign_files else ", or overwrite them (`overwrite=True`)")
             )
         folder.mkdir(parents=True, exist_ok=True)
         for file in present_files:

@@ -126,9 +126,7 @@ def check_file(out: Path, *, overwrite: bool) -> None:
     """
     with write_errors(out):
         if out.exists() and not (overwrite and out.is_file()):
-            raise ResultError(
-                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
-            )
+            raise ResultError(f"{out} already exists; choose another name, or overwrite it (`overwrite=True`)")
         if not out.parent.is_dir():
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
         remove_partial_files(out.parent, glob.escape(out.name))

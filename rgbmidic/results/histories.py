@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
@@ -57,6 +58,14 @@ class Histories:
         What a reader should know, a line each.
     channels
         Recorded beside the test, by the clock of the frames; None: there are none.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")
+    >>> histories = read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),)))
+    >>> u = histories.quantities[0]
+    >>> u.unit, u.values.shape == histories.status.shape == (len(histories.frames),)
+    ('mm', True)
     """
 
     frames: IntArray
@@ -90,6 +99,13 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
     headings : list of str
     rows : list of list of str
         Of every quantity: name, unit, extremes, last value, median standard uncertainty, number of frames.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")
+    >>> headings, rows = history_rows(read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),))))
+    >>> headings[:2], [row[0] for row in rows]
+    (['quantity', 'unit'], ['point_1_u', 'point_1_v'])
     """
     rows = []
     for quantity in histories.quantities:
@@ -126,6 +142,15 @@ def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = 
     ------
     ResultError
         The file exists, its folder does not, or it cannot be written.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")
+    >>> histories = read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),)))
+    >>> write_histories(histories, "history.csv", overwrite=True)
+    >>> Path("history.csv").read_text().split(",")[:3]
+    ['frame', 'number', 'status']
+    >>> Path("history.csv").unlink()
     """
     out = Path(out)
     check_file(out, overwrite=overwrite)
@@ -144,6 +169,7 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
     write_table(file, columns, zip(*(values.tolist() for values in columns.values()), strict=True))
 
 
+@checked
 def read_histories(
     result: Result,
     probes: ProbeSettings,
@@ -185,7 +211,7 @@ def read_histories(
     ['point_1_u', 'point_1_v']
     """
     if not probes.kind_coordinates and probes.rigid_motion == "none":
-        raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
+        raise InputError("no probe is stated, such as a point (`points`, or [probes] of TEST.toml)")
     physical = ResultInUnits.without_times(result, scale)
     base = empty_histories(result, physical)
     rectified, frames, units = replace(physical.rectified, units=base.units), base.frames, base.units

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import secrets
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import may_be_alive, read_json, write_errors
+from rgbmidic.results.files import may_be_alive, read_json, write_errors, write_json
 
 ALL_FRAMES = range(sys.maxsize)
 """All frames that a folder has or will have."""
@@ -52,12 +51,7 @@ class FrameLock:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
             if not (conflict := next(_conflicting_locks(file, frames), None)):
                 holder = {"process": os.getpid(), "host": socket.gethostname()}
-                temporary = file.with_name(f"{file.name}.{holder['host']}.{holder['process']}.part")
-                with write_errors(file):  # whole at once; it need not outlive the machine
-                    temporary.write_text(
-                        json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8"
-                    )
-                    temporary.replace(file)
+                write_json(file, holder | {"first": frames.start, "stop": frames.stop})
                 if not (conflict := next(_conflicting_locks(file, frames), None)):
                     return cls(file=file, process=os.getpid())
                 file.unlink(missing_ok=True)

@@ -22,7 +22,8 @@ from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, st
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, ResultQuantity, map_quantities
+from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, map_quantities
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.results.result_in_units import (
     DISPLACEMENT_QUANTITIES,
@@ -63,6 +64,12 @@ class MapValues:
         Deformed places of the nodes, px of the image; NaN where not measured.
     status : ndarray, shape (N,), uint8
         `node_status`.
+
+    Examples
+    --------
+    >>> exx = Maps.from_result(Result.open("my_result")).read("exx", 1)
+    >>> exx.values.shape == exx.std.shape == exx.status.shape
+    True
     """
 
     values: FloatArray

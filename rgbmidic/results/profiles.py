@@ -81,6 +81,15 @@ class Profile:
     ------
     InputError
         The field has no uncertainty, no frame is measured yet, or half of the line is outside the mesh.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> profile = Profile(maps, "u", (100, 150, 200, 150), frames=[1])
+    >>> profile.fill(maps, [0])
+    >>> profile.values.shape == (1, len(profile.positions))
+    True
     """
 
     def __init__(self, maps: Maps, field: str, endpoints: Sequence[float], frames: Sequence[int] | AnyArray) -> None:
@@ -237,6 +246,15 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     ------
     ResultError
         A file exists, its folder does not, or it cannot be written.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> profile = read_profile(Maps.from_result(Result.open("my_result")), "u", (100, 150, 200, 150))
+    >>> write_profile(profile, "profile.csv", overwrite=True)
+    >>> Path("profile.csv").read_text().split(",")[:3]
+    ['frame', 'number', 'position_mm']
+    >>> Path("profile.csv").unlink()
     """
     out = Path(out)
     arrivals_path = arrivals_file(out)

@@ -32,7 +32,7 @@ SCHEMA_VERSION = 13
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"
-RESTORE_REMEDY = "put back the file that was there, or delete it and go on with --resume"
+RESTORE_REMEDY = "put back the file that was there, or delete it and go on with `resume=True`"
 """What to do about a file of another run."""
 _SEAL = "sha256"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile", "h5py")
@@ -66,6 +66,12 @@ class Origin:
         Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
     notes
         Further plain values to keep in the provenance, such as ``frame_rate`` and ``exposure_ns``.
+
+    Examples
+    --------
+    >>> origin = Origin(nodes=[[0, 0], [9, 0], [0, 9]], elements=[[0, 1, 2]], names=["a.png"], lights=["red"])
+    >>> origin.references
+    (0,)
     """
 
     nodes: npt.ArrayLike
@@ -241,7 +247,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
         raise ResultError(
             f"{path / PROVENANCE} was changed after it was written: put it back as it was. Another [scale], [setup] or "
             "other [probes] or [channels] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps "
-            "them, --test TEST.toml of history, export and report reads with them"
+            "them, `rgbmidic report --test TEST.toml` reads with them (history and export too)"
         )
     return document
 

@@ -1,266 +1,25 @@
-"""The table of numbers of a result: what a quantity is, every quantity that is kept, and those that follow from them.
+"""The table of numbers of a result: every quantity that is kept, and those that follow from them.
 
 Each is declared once, here; records, store, exports, maps and documents read that.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from rgbmidic.errors import InputError
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
-from rgbmidic.renamed import state_new_names
-from rgbmidic.text import format_value, format_with_std
+from rgbmidic.results.quantity import ESTIMATED, ResultQuantity, with_uncertainty
 from rgbmidic.timing import STAGES
-
-Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
-
-
-@state_new_names
-@dataclass(frozen=True, slots=True)
-class ResultQuantity:
-    """An entry of the table: what a name stands for, of every frame or of all together, kept or derived.
-
-    Attributes
-    ----------
-    name
-        Name in records, files, exports and maps. A fraction in a map is named by its light; a standard uncertainty
-        ends in ``_std``.
-    axes
-        Axes in one frame: ``"node"`` and ``"light"`` have the result's sizes, a number is a size itself, and any other
-        word is open: its size may differ from frame to frame. Without axes it is a plain number or text.
-    unit
-        Empty where there is none; ``"px"`` becomes the reader's unit of lengths (`with_units`).
-    source
-        Attribute of the object that it comes from, a `Solution` or a `Strain`, a column of it behind a dot; empty where
-        the main job provides it. That of its standard uncertainty has ``_std`` behind the first word.
-    description
-        Its description in docs/reference/conventions.md.
-    dtype
-        Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
-    blank
-        What a frame holds that could not be measured at all.
-    codes
-        What each integer means, for a status.
-    symbol
-        How formulas and pictures write it; empty for what maps do not show.
-    base_quantities, order
-        Quantities from which it follows: their length where there are two, their derivative by time of an order, a
-        strain or a discretisation error.
-    group
-        Heading under which maps list it.
-    kind
-        Kind of the values, which sets colours and format.
-
-    Examples
-    --------
-    >>> QUANTITIES["u_std"].unit, QUANTITIES["status"].codes
-    ('px', ('converged', 'not converged', 'failed'))
-    """
-
-    name: str
-    axes: tuple[str | int, ...]
-    unit: str
-    source: str
-    description: str
-    _: KW_ONLY
-    dtype: type[np.generic] = np.float32
-    blank: float | int | str = float("nan")
-    codes: tuple[str, ...] = ()
-    symbol: str = ""
-    base_quantities: tuple[str, ...] = ()
-    order: int = 0
-    group: str = "Quality"
-    kind: Kind = "strain"
-
-    @property
-    def file_name(self) -> str:
-        """Name of its array in records and npz files: the small strain of the nodes has no prefix there."""
-        return self.name.removeprefix("nodal_")
-
-    @property
-    def uncertainty(self) -> ResultQuantity:
-        """Its standard uncertainty."""
-        return replace(
-            self,
-            name=f"{self.name}_std",
-            source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
-            description=f"standard uncertainty of {self.name}",
-            symbol=self.symbol and f"σ({self.symbol})",
-            group="Uncertainty",
-            kind="positive",
-        )
-
-    def with_units(self, units: Units) -> ResultQuantity:
-        """Return it with the reader's units of length and time.
-
-        Parameters
-        ----------
-        units
-            Units of the reader.
-
-        Returns
-        -------
-        ResultQuantity
-        """
-        unit = units.length if self.unit == "px" else self.unit
-        return replace(self, unit=units.per_time(unit, self.order) if self.order else unit)
-
-    @property
-    def label(self) -> str:
-        """Symbol and unit, the title of its pictures and axes."""
-        return f"{self.symbol} ({self.unit})" if self.unit else self.symbol
-
-    @property
-    def is_signed(self) -> bool:
-        """True if colours symmetric about 0 make sense."""
-        return self.kind in ("displacement", "strain")
-
-    @property
-    def is_logarithmic(self) -> bool:
-        """True if colours spread by ratio: for uncertainties, and for what is compared with 1."""
-        return self.kind == "positive" and self.group in ("Quality", "Uncertainty")
-
-    @property
-    def stepped(self) -> bool:
-        """True if values between those of two nodes mean nothing."""
-        return self.kind in ("angle", "codes")
-
-    @property
-    def fixed_range(self) -> tuple[float, float] | None:
-        """Values of the first and last colour, where the kind of quantity sets them."""
-        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
-        return fixed.get(self.kind)
-
-    def format(self, value: float, std: float = float("nan")) -> str:
-        """Return a value with its standard uncertainty and unit as text.
-
-        Parameters
-        ----------
-        value
-            The value in the quantity's unit.
-        std
-            Its standard uncertainty; NaN where not known.
-
-        Returns
-        -------
-        str
-        """
-        if not np.isfinite(value):
-            return "not measured"
-        if self.codes:
-            return self.codes[int(value)]
-        if self.group == "Uncertainty":
-            return f"{format_value(value, value)} {self.unit}".rstrip()
-        return format_with_std(value, std, self.unit)
-
-    def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
-        """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.
-
-        Parameters
-        ----------
-        sizes
-            Numbers of ``"node"`` and ``"light"``.
-
-        Returns
-        -------
-        tuple of int or None
-        """
-        return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
-
-    @property
-    def is_stackable(self) -> bool:
-        """True if all frames make one array: no axis is open, and it is no text."""
-        return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
-
-    @property
-    def is_estimated(self) -> bool:
-        """True for a quantity of the nodes that only frames have of which it was requested."""
-        return self.axes == _ESTIMATED
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """Description by the CF conventions: units ("1" where there is none), long_name, and what a status means."""
-        attributes: dict[str, Any] = {"units": self.unit or "1", "long_name": self.description}
-        if self.codes:
-            attributes["flag_values"] = np.arange(len(self.codes), dtype=self.dtype)
-            attributes["flag_meanings"] = " ".join(code.replace(" ", "_") for code in self.codes)
-        return attributes
-
-    def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
-        """Return `value` in the type of the table.
-
-        Parameters
-        ----------
-        value
-            The quantity in one frame.
-        sizes
-            Numbers of ``"node"`` and ``"light"``.
-
-        Returns
-        -------
-        ndarray, or a plain number or text
-
-        Raises
-        ------
-        InputError
-            It has another shape.
-        """
-        array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
-        if array.ndim != len(shape) or any(
-            expected not in (None, length) for expected, length in zip(shape, array.shape, strict=True)
-        ):
-            raise InputError(f"{self.name} of a result has the shape {shape} (None: any), not {array.shape}")
-        return array if self.axes else array.item()
-
-    def unmeasured(self, sizes: Mapping[str, int]) -> Any:
-        """Return the value of a frame that could not be measured; open axes have the length 0.
-
-        Parameters
-        ----------
-        sizes
-            Numbers of ``"node"`` and ``"light"``.
-
-        Returns
-        -------
-        ndarray, or a plain number or text
-        """
-        return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
-
-    def read_from(self, source: object) -> Any:
-        """Take the quantity from an object with the attribute that `source` names.
-
-        Parameters
-        ----------
-        source
-            Object with the attribute.
-
-        Returns
-        -------
-        Any
-        """
-        attribute, _, column = self.source.partition(".")
-        value = getattr(source, attribute)
-        return value[:, int(column)] if column else value
-
-
-def with_uncertainty(*quantities: ResultQuantity) -> tuple[ResultQuantity, ...]:
-    """Return quantities, then the standard uncertainty of each."""
-    return *quantities, *(quantity.uncertainty for quantity in quantities)
-
 
 NO_CHECKSUM = -1
 """`checksum` of a frame that could not be measured at all."""
 UNKNOWN_TIME = np.iinfo(np.int64).min
 """`time_ns` of a frame whose time is not known."""
 
-_ESTIMATED = ("estimated node",)
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
@@ -286,7 +45,8 @@ _TABLE = (
     ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     ResultQuantity("warnings", ("warning",), "", "", "what is doubtful about it, a text each", **_TEXT),
     ResultQuantity("unread", (), "", "",
-        "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
+        "1 if the frame failed because it could not be read (`rgbmidic run --resume` tries again), else 0",
+        dtype=np.int64, blank=0),
     ResultQuantity("tries", (), "", "",
         "2 for a key frame that was also measured from the frame just before it, else 1", dtype=np.int64, blank=1),
     ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
@@ -314,16 +74,16 @@ _TABLE = (
         ResultQuantity("nodal_eyy", _NODE, "", "strain.1", f"small strain in y: {_NODAL_SLOPE}"),
         ResultQuantity("nodal_exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_NODAL_SLOPE}"),
     ),
-    ResultQuantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _DISCRETISATION.format("u")),
-    ResultQuantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _DISCRETISATION.format("v")),
-    ResultQuantity("nodal_exx_mesh_error", _ESTIMATED, "", "strain_error.0", _DISCRETISATION.format("nodal_exx")),
-    ResultQuantity("nodal_eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _DISCRETISATION.format("nodal_eyy")),
-    ResultQuantity("nodal_exy_mesh_error", _ESTIMATED, "", "strain_error.2", _DISCRETISATION.format("nodal_exy")),
+    ResultQuantity("u_mesh_error", ESTIMATED, "px", "displacement_error.0", _DISCRETISATION.format("u")),
+    ResultQuantity("v_mesh_error", ESTIMATED, "px", "displacement_error.1", _DISCRETISATION.format("v")),
+    ResultQuantity("nodal_exx_mesh_error", ESTIMATED, "", "strain_error.0", _DISCRETISATION.format("nodal_exx")),
+    ResultQuantity("nodal_eyy_mesh_error", ESTIMATED, "", "strain_error.1", _DISCRETISATION.format("nodal_eyy")),
+    ResultQuantity("nodal_exy_mesh_error", ESTIMATED, "", "strain_error.2", _DISCRETISATION.format("nodal_exy")),
     ResultQuantity("match", (), "", "",
         "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
         "without `frames.update_reference`"),
     ResultQuantity("best_match", (), "", "",
-        "largest `match` of the frames compared with the same reference, up to this one", blank=0),
+        "largest match of the frames compared with the same reference, up to this one", blank=0),
     ResultQuantity("reference_updates", ("reference_update",), "", "",
         "indices in the result of the frames that became the reference, up to this one: this frame was compared with "
         "the last one before it, or with the test's reference", dtype=np.int64, blank=0),
@@ -336,13 +96,13 @@ _TABLE = (
     ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction",
         "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
     ResultQuantity("brightness", ("light", 2), "", "",
-        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians "
-        "over the elements; reported, not used"),
+        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle; "
+        "reported, not used"),
     ResultQuantity("rigid", ("light", "function"), "", "rigid",
         "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
         "a light that sees nothing"),
     ResultQuantity("seconds", (len(STAGES),), "s", "",
-        f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
+        f"time of each of the stages {', '.join(STAGES)}; NaN without `rgbmidic run --timings`"),
     ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
     ResultQuantity("reflection_thumbnail", _PICTURE, "", "",
         "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it",

@@ -44,7 +44,7 @@ _VERSION, _DATE = 20, 0x21
 """Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
 _STORED, _DEFLATED = 0, 8
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
-_REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
+_REMEDY = "`rgbmidic run --resume` measures it again, `partial=True` reads the rest"
 
 
 @lru_cache(maxsize=4)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import read_arrays, read_json, write_json
@@ -114,6 +115,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
     node_mm: FloatArray | None = None
 
     @classmethod
+    @checked
     def open(cls, path: Path | str, *, partial: bool = False, check: bool = True) -> Self:
         """Open a result folder.
 
@@ -188,7 +190,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         if "finished" in self.provenance or self.table.damaged.any():
             raise ResultError(
                 f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-                "--resume` measures them again, --partial (partial=True) reads the rest"
+                "--resume` measures them again, `partial=True` reads the rest"
             )
         raise ResultError(
             f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
@@ -287,6 +289,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         values = next(self.table.iterate(None, [int(index) % len(self)]))
         return FrameRecord(values=values, sizes=self.table.sizes)
 
+    @checked
     def iterate(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
 
@@ -304,6 +307,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         indices = range(len(self)) if frames is None else frames
         return (values[name] for values in self.table.iterate([name], indices))
 
+    @checked
     def stack(self, name: str) -> AnyArray:
         """Read one quantity of all frames into one array, the frames as first axis.
 
@@ -435,6 +439,12 @@ def finish_result(path: Path | str, warnings: Sequence[str] = ()) -> None:
     ------
     ResultError
         The folder is no result, a frame is missing or damaged, or it cannot be written.
+
+    Examples
+    --------
+    >>> finish_result("my_result")
+    >>> "finished" in Result.open("my_result").provenance
+    True
     """
     result = Result.open(path, partial=True, check=False)
     result.without_damaged()._check_complete()

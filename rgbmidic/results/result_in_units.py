@@ -21,7 +21,8 @@ from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
-from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME, ResultQuantity
+from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME
+from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
@@ -95,6 +96,11 @@ def placement_of(result: Result) -> Placement | None:
     Returns
     -------
     Placement or None
+
+    Examples
+    --------
+    >>> placement_of(Result.open("my_result")) is None  # its mesh is of no file
+    True
     """
     document = result.provenance.get("finite_elements")
     return None if document is None else Placement.from_document(document["placement"], _stored_camera(result))

@@ -57,6 +57,18 @@ class Simulation:
         In seconds (or in frames, where these have no times), rising; None for one state without a time.
     name : str
         The file or folder, for messages.
+
+    Examples
+    --------
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 8], [0, 8]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> Simulation(mesh=mesh, displacement=np.zeros((1, 4, 2))).interpolate(0.0).shape
+    (4, 2)
     """
 
     mesh: FiniteElementMesh
@@ -103,12 +115,12 @@ class Simulation:
         path = Path(path)
         table = path.suffix.lower() == ".csv"
         if interval is not None and not path.is_dir():
-            raise InputError(f"--interval is the time between the files of a folder, and {path} is none")
+            raise InputError(f"`interval` is the time between the files of a folder, and {path} is none")
         if field is not None and table:
-            raise InputError(f"--field names a field of a mesh file; the columns of {path} have names of their own")
+            raise InputError(f"`field` names a field of a mesh file; the columns of {path} have names of their own")
         if table:
             if mesh is None:
-                raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
+                raise InputError(f"{path} has numbers of nodes only: state the `mesh` that they belong to")
             values, times = _read_table(path, mesh, unit)
         else:
             clock, files = zip(*_list_states(path, interval), strict=True)
@@ -124,7 +136,7 @@ class Simulation:
             raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
         if offset and (times is None or len(times) == 1):
             raise InputError(
-                f"--offset shifts the times of several states; {path} is one, and is compared with every frame"
+                f"`offset` shifts the times of several states; {path} is one, and is compared with every frame"
             )
         return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
 
@@ -167,7 +179,7 @@ def _list_numbered_states(path: Path, interval: float | None) -> list[tuple[floa
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:
         raise InputError(
-            f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
+            f"the times of the files in {path} are not known: state `interval`, the time between two numbers (above 0)"
         )
     return sorted(
         (interval * float(numbers[-1]), file) for numbers, file in zip(files.numbers, files.paths, strict=True)
@@ -182,7 +194,7 @@ def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
     if values is None or values.ndim != 2 or values.shape[1] <= max(mesh.axes):
         available = ", ".join(f"{name} {entry.shape[1:]}" for name, entry in mesh.fields.items()) or "none"
         requested = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
-        raise InputError(f"{mesh.name} has no nodal vector {requested} (--field); its nodal data: {available}")
+        raise InputError(f"{mesh.name} has no nodal vector {requested} (`field`); its nodal data: {available}")
     return np.asarray(values[:, mesh.axes], dtype=np.float64) * mesh.unit_mm
 
 
@@ -228,7 +240,13 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
 
 
 def label_indices(numbers: IntArray, labels: npt.NDArray[Any]) -> IntArray:
-    """Return the index of each label among some numbers; -1 where it is none of them."""
+    """Return the index of each label among some numbers; -1 where it is none of them.
+
+    Examples
+    --------
+    >>> label_indices(np.array([7, 3, 5]), np.array([5, 7, 4])).tolist()
+    [2, 0, -1]
+    """
     positions = {number: position for position, number in enumerate(numbers.tolist())}
     return np.array([positions.get(number, -1) for number in labels.tolist()], dtype=np.int64)
 
@@ -251,14 +269,20 @@ def find_placement(
     ------
     InputError
         No points are known, or they place no mesh.
+
+    Examples
+    --------
+    >>> placement = find_placement(Result.open("my_result"), point_pairs=[(0, 0, 40, 240), (10, 0, 240, 240)])
+    >>> round(placement.mm_per_pixel, 6)
+    0.05
     """
-    points, source = point_pairs, "--points"
+    points, source = point_pairs, "`point_pairs`"
     if not points and (stored_placement := placement_of(result)) is not None:
         points, source = stored_placement.pairs.tolist(), "mesh.points"
     if not points:
         raise InputError(
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
-            "--points X_MM,Y_MM:X_PX,Y_PX each"
+            "each in mm and in px (`point_pairs`)"
         )
     placement = Placement.fit(points, rectification_of(result, scale, "mm").camera, label=source)
     mm_per_pixel = (

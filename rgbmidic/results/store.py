@@ -260,8 +260,8 @@ def _empty_folder(path: Path, *, overwrite: bool) -> None:
         return
     if not overwrite:
         raise ResultError(
-            f"{path} already holds a result; choose another folder, overwrite it (overwrite=True, --overwrite), or go "
-            "on with it (--resume)"
+            f"{path} already holds a result; choose another folder, overwrite it (`overwrite=True`), or go on with "
+            "it (`resume=True`)"
         )
     with write_errors(path):
         old_files = (path / FRAMES).glob("[0-9]*.frames")  # of schema versions to 10

@@ -7,7 +7,7 @@ import math
 import operator
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePath
@@ -37,6 +37,11 @@ def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
     ------
     ConfigurationError
         It is no section.
+
+    Examples
+    --------
+    >>> read_table({"scale": {"frame_rate": 1000}}, "scale"), read_table({}, "scale")
+    ({'frame_rate': 1000}, {})
     """
     table = document.get(name, {})
     if not isinstance(table, Mapping):
@@ -62,6 +67,11 @@ def require_regular_file(path: Path) -> Path:
     ------
     OSError
         It is not a regular file.
+
+    Examples
+    --------
+    >>> require_regular_file(Path("test.toml")).name
+    'test.toml'
     """
     if "\0" in str(path):
         raise OSError("its name holds a NUL")
@@ -88,6 +98,11 @@ def read_toml(path: Path, description: str) -> dict[str, Any]:
     ------
     ConfigurationError
         The file, `description` in words, is missing or not TOML.
+
+    Examples
+    --------
+    >>> read_toml(Path("test.toml"), "test")["calibration"]
+    {'file': 'calibration.json'}
     """
     try:
         return tomllib.loads(require_regular_file(path).read_text(encoding="utf-8-sig"))
@@ -113,6 +128,12 @@ def check_names(names: Iterable[str], allowed: Iterable[str], noun: str, locatio
     ------
     ConfigurationError
         A name is not allowed; the message holds the closest one that is.
+
+    Examples
+    --------
+    >>> check_names(["fil"], ["model", "fill"], "key", "[solver]")
+    Traceback (most recent call last):
+    rgbmidic.errors.ConfigurationError: unknown key "fil" in [solver] (did you mean "fill"?); allowed are model, fill
     """
     allowed = list(allowed)
     for name in names:
@@ -154,6 +175,11 @@ def convert_value(value: Any, hint: Any, key: str, base: Path | str = "") -> Any
     ------
     ConfigurationError
         The value cannot be converted without a loss.
+
+    Examples
+    --------
+    >>> convert_value([1, 2], tuple[float, ...], "region.corner")
+    (1.0, 2.0)
     """
     value, origin, kinds = _to_python(value), get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):  # X | None; a number | a word
@@ -209,6 +235,11 @@ def read_range(text: str, key: str) -> range:
     ------
     ConfigurationError
         It is something else, or nothing is in it.
+
+    Examples
+    --------
+    >>> read_range("0:20", "frames.reference")
+    range(0, 20)
     """
     match = re.fullmatch(r"\s*(\d{1,18})\s*:\s*(\d{1,18})\s*", text)
     if not match or int(match[1]) >= int(match[2]):
@@ -258,6 +289,11 @@ def to_plain(value: Any) -> Any:
     Returns
     -------
     dict, list, str, number or None
+
+    Examples
+    --------
+    >>> to_plain({"file": Path("a.csv"), "size": (1.0, math.nan)})
+    {'file': 'a.csv', 'size': [1.0, None]}
     """
     if is_dataclass(value):
         return {entry.name: to_plain(getattr(value, entry.name)) for entry in fields(value)}
@@ -290,6 +326,16 @@ def bounded(default: Any = MISSING, **bounds: float) -> Any:
     Returns
     -------
     dataclasses.Field
+
+    Examples
+    --------
+    >>> from dataclasses import make_dataclass
+    >>> Gauge = make_dataclass("Gauge", [("length", float, bounded(10.0, above=0))], frozen=True, kw_only=True)
+    >>> read_section(Gauge, "gauge", {"length": 4}).length
+    4.0
+    >>> read_section(Gauge, "gauge", {"length": -4})
+    Traceback (most recent call last):
+    rgbmidic.errors.ConfigurationError: gauge.length must be above 0, not -4
     """
     return field(default=default, metadata={"bounds": bounds})
 
@@ -315,6 +361,13 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, int | float) else []
 
 
+def convert_fields(instance: object, convert: Callable[[Field[Any], Any, Any], Any]) -> None:
+    """Replace each field of a frozen dataclass by what `convert` makes of the field, its value and its annotation."""
+    hints = type_hints(cast(Any, type(instance)))
+    for entry in fields(cast(Any, instance)):
+        object.__setattr__(instance, entry.name, convert(entry, getattr(instance, entry.name), hints[entry.name]))
+
+
 class CheckedSettings:
     """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
 
@@ -322,11 +375,10 @@ class CheckedSettings:
     section = ""
 
     def __post_init__(self) -> None:
-        hints = type_hints(cast(Any, self.__class__))
-        for entry in fields(cast(Any, self)):
-            key = f"{self.section}.{entry.name}".lstrip(".")
-            value = convert_field(entry, getattr(self, entry.name), hints[entry.name], key)
-            object.__setattr__(self, entry.name, value)
+        convert_fields(
+            self,
+            lambda entry, value, hint: convert_field(entry, value, hint, f"{self.section}.{entry.name}".lstrip(".")),
+        )
         for problem in self._problems():
             raise ConfigurationError(problem)
 
@@ -361,6 +413,12 @@ def read_section(
     ------
     ConfigurationError
         A key is unknown, missing, of the wrong type, out of range, or contradicts another.
+
+    Examples
+    --------
+    >>> from rgbmidic.settings import FrameSettings
+    >>> read_section(FrameSettings, "frames", {"path": "frames/*.dng", "step": 2}).step
+    2
     """
     hints = {key: hint for key, hint in type_hints(cast(Any, kind)).items() if key not in values}
     check_names(content, hints, "key", f"[{name}]")
@@ -392,6 +450,13 @@ def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     ------
     ValueError
         A key is stated twice.
+
+    Examples
+    --------
+    >>> import json
+    >>> json.loads('{"a": 1, "a": 2}', object_pairs_hook=unique_keys)
+    Traceback (most recent call last):
+    ValueError: the key "a" is stated twice
     """
     keys = [key for key, _ in pairs]
     if len(document := dict(pairs)) < len(keys):

@@ -19,6 +19,7 @@ from rgbmidic.settings.conversion import (
     CheckedSettings,
     bounded,
     check_names,
+    convert_value,
     read_section,
     read_table,
     read_toml,
@@ -54,6 +55,12 @@ class ScaleSettings(CheckedSettings):
         Frames per second, for files that do not state when their frames were taken.
     unit
         Unit of lengths: ``"mm"`` where the scale is known, or ``"px"`` of the image though it is.
+
+    Examples
+    --------
+    >>> scale = ScaleSettings(mm_per_pixel=0.05, frame_rate=100_000)
+    >>> scale.mm_per_pixel, scale.frame_rate
+    (0.05, 100000.0)
     """
 
     section = "scale"
@@ -119,6 +126,12 @@ class ProbeSettings(CheckedSettings):
         they are also subtracted from the displacements.
     names
         Pairs of a probe, kind and number, such as ``"gauge_1"``, and the name that it has in tables and curves.
+
+    Examples
+    --------
+    >>> probes = ProbeSettings(points=[[120, 80]], gauges=[[40, 80, 200, 80]])
+    >>> probes.gauges
+    ((40.0, 80.0, 200.0, 80.0),)
     """
 
     section = "probes"
@@ -159,7 +172,7 @@ class ProbeSettings(CheckedSettings):
         if self.tips and missing:
             yield (
                 'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
-                f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}'
+                f'"strain"); missing: {", ".join(missing)}'
             )
         if self.terms == 1:
             yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"
@@ -207,6 +220,12 @@ class ChannelSettings(CheckedSettings):
         Cross-section of the specimen in square mm, for a stress.
     force
         Name of the channel with the force; None: the only one whose name ends in N or kN.
+
+    Examples
+    --------
+    >>> channels = ChannelSettings(file="force.csv", trigger="trigger_V", area=40.0)
+    >>> channels.trigger, channels.offset
+    ('trigger_V', 0.0)
     """
 
     section = "channels"
@@ -252,6 +271,11 @@ class SetupSettings(CheckedSettings):
         Who tested.
     notes
         Anything else.
+
+    Examples
+    --------
+    >>> SetupSettings(lens="100 mm macro", aperture="f/8").aperture
+    'f/8'
     """
 
     section = "setup"
@@ -331,13 +355,16 @@ class TestSettings(CheckedSettings):
         ConfigurationError
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
-        base, kinds = Path(base).resolve(), section_types()
+        if not isinstance(document, Mapping):
+            raise ConfigurationError(f"the document of a test maps sections to their keys; given is {document!r:.80}")
+        folder: Path = convert_value(base, Path, "base").resolve()
+        kinds = section_types()
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
         document = without_former_keys(document)
-        sections = {name: read_section(kinds[name], name, read_table(document, name), base) for name in document}
-        return cls(base=base, **sections)
+        sections = {name: read_section(kinds[name], name, read_table(document, name), folder) for name in document}
+        return cls(base=folder, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
         """Return the settings as sections of plain values, defaults included, without `base` and what is not known.
@@ -360,7 +387,7 @@ def section_types() -> dict[str, Any]:
 
 
 def read_test(path: Path | str) -> TestSettings:
-    r"""Read the settings of a test from a TOML file; paths in it are relative to it.
+    """Read the settings of a test from a TOML file; paths in it are relative to it.
 
     Parameters
     ----------
@@ -378,20 +405,16 @@ def read_test(path: Path | str) -> TestSettings:
 
     Examples
     --------
-    >>> from pathlib import Path
-    >>> from rgbmidic import read_test
-    >>> text = "[frames]\npath = 'frames/*.dng'\n[region]\nrectangle = [10, 10, 90, 70]\n[mesh]\nelement_size = 20\n"
-    >>> _ = Path("test.toml").write_text(text)
     >>> settings = read_test("test.toml")
-    >>> settings.mesh.element_size, settings.region.rectangle
-    (20.0, (10.0, 10.0, 90.0, 70.0))
+    >>> settings.frames.path, settings.calibration.file.name
+    (('frames/*.dng',), 'calibration.json')
     """
-    path = Path(path)
-    document = read_toml(path, "settings file")
+    file: Path = convert_value(path, Path, "read_test: path")
+    document = read_toml(file, "settings file")
     try:
-        return TestSettings.from_mapping(document, path.parent)
+        return TestSettings.from_mapping(document, file.parent)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{path}: {error}") from None
+        raise ConfigurationError(f"{file}: {error}") from None
 
 
 _FORMER_BRIGHTNESS = {"global": "constant", "local": "auto", "mean": "auto"}

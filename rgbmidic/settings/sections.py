@@ -46,6 +46,12 @@ class FrameSettings(CheckedSettings):
     crop_origin
         Column and row in the calibrated frame of the first pixel of cropped frames; None: they are as large as the
         calibrated ones, or nothing in the calibration depends on the position.
+
+    Examples
+    --------
+    >>> frames = FrameSettings(path="frames/*.tif", kind="monochrome", reference="0:3")
+    >>> frames.path, frames.reference
+    (('frames/*.tif',), (0, 1, 2))
     """
 
     section = "frames"
@@ -99,6 +105,11 @@ class IlluminationSettings(CheckedSettings):
     demosaic
         Method of `rgbmidic.illumination.separation` for Bayer frames; ``"auto"``: the reflection-aware one, and
         Malvar's for frames too small for it.
+
+    Examples
+    --------
+    >>> IlluminationSettings(demosaic="malvar").demosaic
+    'malvar'
     """
 
     section = "illumination"
@@ -131,6 +142,11 @@ class CalibrationSettings(CheckedSettings):
     accept
         Checks of the reference frame against the calibration whose contradictions are accepted
         (`rgbmidic.illumination.frame_check`).
+
+    Examples
+    --------
+    >>> CalibrationSettings(file="calibration.json").file.name
+    'calibration.json'
     """
 
     section = "calibration"
@@ -163,7 +179,13 @@ class MeshSettings(CheckedSettings):
         frames (``"key"``): every 16th and the last.
     refine
         Whether elements are bisected where the discretisation error of strain is more than twice its noise
-        (`rgbmidic.pipeline.resolution.refine`), in the frame of this index, or in a key frame (True).
+        (`rgbmidic.pipeline.refinement.refine`), in the frame of this index, or in a key frame (True).
+
+    Examples
+    --------
+    >>> mesh = MeshSettings(element_size=20, cracks=[[[60, 100], [120, 100]]], error=True)
+    >>> mesh.cracks
+    (((60.0, 100.0), (120.0, 100.0)),)
     """
 
     section = "mesh"
@@ -224,6 +246,12 @@ class RegionSettings(CheckedSettings):
         Image file; pixels of at least half of its largest value belong to the region.
     holes
         Polygons, each of corners (x, y) in px, whose pixels do not belong to it.
+
+    Examples
+    --------
+    >>> region = RegionSettings(rectangle=(10, 10, 90, 70), holes=[[[40, 40], [60, 40], [50, 60]]])
+    >>> region.rectangle, len(region.holes)
+    ((10.0, 10.0, 90.0, 70.0), 1)
     """
 
     section = "region"
@@ -279,6 +307,11 @@ class WeightSettings(CheckedSettings):
     limit_deg
         Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
         the variance expected from geometry, paint and camera noise.
+
+    Examples
+    --------
+    >>> WeightSettings().method, WeightSettings(method="threshold", threshold=0.5).threshold
+    ('statistics', 0.5)
     """
 
     section = "weights"
@@ -347,7 +380,14 @@ class SolverSettings(CheckedSettings):
 
 
 class SolverOptions(TypedDict, total=False):
-    """The fields of `SolverSettings` as options of a function."""
+    """The fields of `SolverSettings` as options of a function.
+
+    Examples
+    --------
+    >>> options: SolverOptions = {"fill": 3, "prefilter": "none"}
+    >>> SolverSettings(**options).prefilter
+    'none'
+    """
 
     prefilter: Literal["none", "binomial", "gaussian"]
     rigid: Literal["none", "translation", "translation+rotation"]

@@ -20,9 +20,10 @@ from rgbmidic.report.style import time_axis
 from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import FRAME_MARK_STYLE, uncertainty_band
+from rgbmidic.view.curves import uncertainty_band
 from rgbmidic.view.fields import FieldsInView
 from rgbmidic.view.picture import IMAGE, columns, plain_plot
+from rgbmidic.view.time_line import FRAME_MARK_STYLE
 from rgbmidic.view.url_state import probe_marks, probe_position
 from rgbmidic.view.widgets import LIVE_REGION, Background, aria_group, warning
 

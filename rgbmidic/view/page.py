@@ -21,12 +21,13 @@ from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import format_with_std
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import CurvePanel, FrameProgress, TimeLine
+from rgbmidic.view.curves import CurvePanel
 from rgbmidic.view.fields import FieldsInView
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
 from rgbmidic.view.panels import FileButtons, MovieButton, ProbeNames
 from rgbmidic.view.picture import Canvas
+from rgbmidic.view.time_line import FrameProgress, TimeLine
 from rgbmidic.view.url_state import BACKGROUNDS, EXTRA_FIELDS, SCALE, UNCERTAINTY, Mark, UndoHistory, ViewState
 from rgbmidic.view.widgets import ResultControls, SharedState, call_periodically, run_guarded, script, warning
 

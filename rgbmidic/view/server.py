@@ -35,11 +35,11 @@ from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import FrameProgress
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, Run
 from rgbmidic.view.test_file_editor import Draft
+from rgbmidic.view.time_line import FrameProgress
 from rgbmidic.view.url_state import ViewState
 from rgbmidic.view.widgets import page_file
 
@@ -93,6 +93,14 @@ def serve(
         The folder is not a result, or is damaged.
     InputError
         The port is in use; or `statement` is not empty and `path` is something else than frames.
+
+    Examples
+    --------
+    >>> def stop(address):  # else it answers until Ctrl-C
+    ...     raise SystemExit
+    >>> serve(Path("my_result"), browser=False, report_address=stop)
+    Traceback (most recent call last):
+    SystemExit
     """
     for library in ("bokeh", "tornado"):  # their messages on a malformed request are for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)
@@ -116,7 +124,7 @@ def start_server(path: Path, *, port: int = 0, statement: Mapping[str, Any] | No
         sockets, port = bind_sockets(_HOST, port)
     except OSError as error:
         raise InputError(
-            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
+            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another `port`, or none"
         ) from None
     application = _Application(
         {route: _Site(FunctionHandler(page)) for route, page in pages.items()},

@@ -145,7 +145,7 @@ class SetupPage:
         index = min(self.state.requested_frame, len(self.source.series) - 1)
         name = html.escape(self.source.series.name(index))
         self.controls.description.text = f"Frame {index} of 0 to {len(self.source.series) - 1}: {name}"
-        raw, is_saturated = self.source.raw(index)
+        raw, is_saturated = self.source.read_picture(index)
         picture_name = self.controls.picture.value
         picture = self.pictures.get(picture_name, raw)
         overlay, window = self._expected if picture_name == _EXPECTED else None, self.canvas.window
@@ -214,7 +214,7 @@ class SetupPage:
     def _receive(self, read_inspection: Callable[[], Inspection], index: int) -> None:
         inspection, self._inspected = read_inspection(), index
         self.pictures = pictures(inspection, self.source.shape)
-        self.controls.tiles.text = overview(inspection, self.pictures, self.source.raw(index)[0])
+        self.controls.tiles.text = overview(inspection, self.pictures, self.source.read_picture(index)[0])
         self.controls.picture.options = [RAW, *self.pictures, _EXPECTED]
         finite = inspection.prediction.std[np.isfinite(inspection.prediction.std)]
         mesh: dict[str, Any] = {"nodes": inspection.mesh.nodes, "elements": inspection.mesh.elements}

@@ -80,7 +80,7 @@ class DraftFrames:
         count = max(self.series.n_lights, len(self.series.lights))
         return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
 
-    def raw(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
+    def read_picture(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
         """Read a raw frame as a picture (H, W), and where a channel is saturated (H, W)."""
         frame = self.series.read(index)[0]
         saturated = frame.values >= frame.white_level

@@ -43,6 +43,16 @@ class LightWeights(Protocol):
     - ``notes``: numbers that were found out about the weights, by name, for the provenance;
     - ``describe()``: a text that says what they are; another text is another test, which `resume` refuses;
     - ``precision(residual)``: a factor on them, learnt from the residual (`rgbmidic.correlation.PrecisionMethod`).
+
+    Examples
+    --------
+    >>> class SecondLight:
+    ...     def reference(self, images: IlluminationImages) -> FloatImage:
+    ...         return np.stack([np.full(images.shape, light == 1, dtype=np.float32) for light in range(3)])
+    ...
+    ...     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
+    ...         return self.reference(images)
+    >>> weights: LightWeights = SecondLight()
     """
 
     def reference(self, images: IlluminationImages) -> FloatImage:
@@ -95,6 +105,15 @@ class MaskWeights:
     ------
     InputError
         The masks are not (k, H, W), or not from 0 to 1.
+
+    Examples
+    --------
+    >>> values = np.full((2, 4, 5), 100.0)
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red", "blue"), full_scale=255.0)
+    >>> masks = np.ones((2, 4, 5))
+    >>> masks[1, :, :2] = 0  # a lamp's reflection
+    >>> MaskWeights(masks).deformed(images, 1)[1, 0].tolist()
+    [0.0, 0.0, 1.0, 1.0, 1.0]
     """
 
     masks: npt.ArrayLike | Callable[[IlluminationImages], npt.ArrayLike]
@@ -218,6 +237,11 @@ def precision_method(weights: Any, method: str) -> PrecisionMethod | None:
     Returns
     -------
     PrecisionMethod or None
+
+    Examples
+    --------
+    >>> precision_method(None, "statistics") == Statistics()
+    True
     """
     if hasattr(weights, "precision"):
         return weights  # type: ignore[no-any-return]
@@ -248,6 +272,11 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     ------
     InputError
         Another shape, negative or not finite.
+
+    Examples
+    --------
+    >>> as_weights(np.array([[0, 1], [1, 1]]), (2, 2), "masks").dtype
+    dtype('float32')
     """
     if weights is None:
         return None
@@ -305,6 +334,14 @@ def prepare_weights(
         ``"images"`` are not one per light or not of the size of the frames.
     FrameError
         A mask cannot be read.
+
+    Examples
+    --------
+    >>> from rgbmidic.settings import read_test
+    >>> values, region = np.full((3, 40, 60), 100.0), Region.from_rectangle((10, 10, 50, 30), shape=(40, 60))
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red", "green", "blue"), full_scale=4095.0)
+    >>> type(prepare_weights(read_test("test.toml"), images, region, frames=2, images_of=lambda frame: images)).__name__
+    'Statistics'
     """
     weights = settings.weights
     frame = shape or reference.shape
@@ -364,6 +401,16 @@ class Statistics(ValidPixels):
         it lights differ by 2e-4 px at most (benchmarks/constants.py).
     window
         In which variances are found.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import measure_sequence
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(1, 80, 80)), (0, 1.5, 1.5))
+    >>> states = [speckle, np.roll(speckle, 1, axis=2)]
+    >>> solutions = measure_sequence(states, element_size=40, weights=Statistics(independent_fraction=0.2))
+    >>> [solution.status.name for solution in solutions]
+    ['CONVERGED', 'CONVERGED']
     """
 
     freedom: float = 4.0

@@ -75,6 +75,14 @@ def threshold_weights(images: IlluminationImages, *, threshold: float = FALLBACK
     -------
     ndarray, shape (k, H, W), float32
         Invalid (saturated) pixels count as full scale in the blur and have weight 0.
+
+    Examples
+    --------
+    >>> values = np.full((1, 40, 60), 100.0)
+    >>> values[:, :, 40:] = 900
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=1000.0)
+    >>> threshold_weights(images, blur=2.0)[0, 20, [0, 59]].tolist()
+    [1.0, 0.0]
     """
     bright = blurred(images, blur) > threshold * images.full_scale
     return (images.valid & ~bright).astype(np.float32)
@@ -93,6 +101,13 @@ def blurred(images: IlluminationImages, blur: float) -> FloatImage:
     Returns
     -------
     ndarray, shape (k, H, W), float32
+
+    Examples
+    --------
+    >>> values = np.full((1, 40, 60), 100.0)
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=1000.0)
+    >>> blurred(images, 2.0)[0, 20, 30].round(3)
+    np.float32(100.0)
     """
     filled = np.where(images.valid, images.values, np.float32(images.full_scale))
     return np.stack([cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101) for image in filled])
@@ -151,6 +166,15 @@ class DisturbedZone:
         Largest P of the rings near the centre over that on the unaffected zone. The paper's zone stands out 4 times.
     chance
         The contrast that noise alone reaches in that ring in one of a thousand measurements.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:300, :300]
+    >>> disturbance = 0.2 * np.exp(-((x - 150) ** 2 + (y - 150) ** 2) / 2 / 15**2)
+    >>> field = np.random.default_rng(0).normal(size=(300, 300)) * (0.01 + disturbance)
+    >>> zone = disturbed_zone(field, (150.0, 150.0))
+    >>> zone.centre, zone.contrast > zone.chance
+    ((150.0, 150.0), True)
     """
 
     centre: tuple[float, float]
@@ -174,6 +198,17 @@ class SetUpThreshold:
         Mean grey level of the blurred image on its perimeter, as a fraction of the dynamic range.
     value
         The threshold for `rgbmidic.weights.threshold.threshold_weights` and ``weights.threshold`` of a TEST.toml.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:300, :300]
+    >>> reflection = np.exp(-((x - 150) ** 2 + (y - 150) ** 2) / 2 / 15**2)
+    >>> values = 1000 + 3000 * reflection[None]
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=4095.0)
+    >>> field = np.random.default_rng(0).normal(size=(300, 300)) * (0.01 + 0.2 * reflection)
+    >>> found = set_up_threshold(field, images)
+    >>> found.zone.radius > 0
+    True
     """
 
     zone: DisturbedZone
@@ -203,6 +238,15 @@ def disturbed_zone(
     ------
     InputError
         The measured field is too small to tell.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:300, :300]
+    >>> disturbance = 0.2 * np.exp(-((x - 150) ** 2 + (y - 150) ** 2) / 2 / 15**2)
+    >>> field = np.random.default_rng(0).normal(size=(300, 300)) * (0.01 + disturbance)
+    >>> zone = disturbed_zone(field, (150.0, 150.0))
+    >>> 58 < zone.radius < 62  # px
+    True
     """
     rows, columns = np.nonzero(np.isfinite(high_passed))
     distance = np.hypot(columns - centre[0], rows - centre[1])
@@ -264,6 +308,16 @@ def set_up_threshold(
     InputError
         The displacement is nowhere disturbed beyond chance: the set-up needs no weights, or the motion is too small to
         show it.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:300, :300]
+    >>> reflection = np.exp(-((x - 150) ** 2 + (y - 150) ** 2) / 2 / 15**2)
+    >>> values = 1000 + 3000 * reflection[None]
+    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red",), full_scale=4095.0)
+    >>> field = np.random.default_rng(0).normal(size=(300, 300)) * (0.01 + 0.2 * reflection)
+    >>> round(set_up_threshold(field, images).value, 2)
+    0.22
     """
     from scipy.ndimage import map_coordinates
 

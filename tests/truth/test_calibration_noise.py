@@ -36,7 +36,7 @@ def test_two_per_cent_from_eighteen_frames(target):
 def test_ninety_five_percent_intervals_cover(target):
     inside = []
     for seed in range(SEEDS):
-        noise = measure(seed, (192, 192), target, (600, 1800, 3000), darks=3)
+        noise = measure(seed, (144, 144), target, (600, 1800, 3000), darks=3)
         figures = ((noise.gain, GAIN), (noise.dark_noise, READ * GAIN), (noise.black_level, BLACK))
         inside.append([np.abs(figure.value - truth) < 1.96 * figure.std for figure, truth in figures])
     covered = np.mean(inside, axis=(0, 2))

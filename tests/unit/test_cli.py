@@ -492,12 +492,6 @@ def test_installed_command_ends_with_the_status_and_without_traceback(tmp_path: 
         assert ("Traceback" in done.stderr) is traces
 
 
-def test_the_package_needs_neither_typer_nor_matplotlib() -> None:
-    code = "import sys, rgbmidic; print({'typer', 'rich', 'matplotlib', 'colour'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
 @pytest.mark.parametrize(("text", "shape"), [("512x768", (512, 768)), ("512,768", (512, 768)), ("", None)])
 def test_a_shape_is_written_one_way_and_read_in_two(text: str, shape: tuple[int, int] | None) -> None:
     assert read_shape(text) == shape

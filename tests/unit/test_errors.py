@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import logging
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+import rgbmidic
+from rgbmidic import cli, command
 from rgbmidic.command import OnceFilter
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.settings import TestSettings
@@ -44,3 +50,38 @@ def test_a_text_is_shown_once() -> None:
         logging.makeLogRecord({"msg": text, "args": args}) for text, args in (("a %d", (1,)), ("b", ()), ("a 1", ()))
     ]
     assert [once.filter(record) for record in records] == [True, True, False]
+
+
+def messages() -> Iterator[str]:
+    """Yield the texts of the library, without its docstrings and its commands; ``{}`` for what is filled in."""
+    package = Path(rgbmidic.__file__).parent
+    for path in (
+        path for path in package.rglob("*.py") if not path.name.startswith(("cli", "command", "result_source"))
+    ):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        nodes = list(ast.walk(tree))
+        within = {part for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node)} | {
+            node.value for node in nodes if isinstance(node, ast.Expr)
+        }
+        for node in nodes:
+            if isinstance(node, ast.JoinedStr):
+                yield "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in within:
+                yield node.value
+
+
+def test_the_library_names_arguments_and_a_command_the_options_that_state_them() -> None:
+    commands = get_command(cli.app).commands.values()  # type: ignore[attr-defined]
+    options = {option for entry in commands for parameter in entry.params for option in parameter.opts}
+    whole_command = re.compile(r"rgbmidic(-calibrate)?( [^`);]*)?")
+    for message in messages():
+        if re.fullmatch("--[a-z-]+", message):  # an argument of a command that is started
+            continue
+        assert not re.search(r"(?<!var\()--[a-z]", whole_command.sub("", message)), message
+        for argument in re.findall(r"`[a-z_]+(?:=True)?`", message):
+            assert command.name_options(argument) in options, message
+
+
+def test_a_command_reports_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.fail("`retry_failed` goes with `resume=True`: see `rgbmidic run`") == 1
+    assert capsys.readouterr().err == "error: --retry-failed goes with --resume: see `rgbmidic run`\n"

@@ -19,6 +19,7 @@ from rgbmidic.illumination import linearise
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import Quantity
+from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.lab.measures import areas_along_x, fit_lobe, residual_percent, rms_slope
 from rgbmidic.scene.camera import rotation
 from rgbmidic.scene.scene import State
@@ -161,9 +162,26 @@ def test_strange_arguments_are_taken_or_refused(name: str, tmp_path: Path, monke
 
 @pytest.mark.parametrize("path", ["\0", b"x", None, 7])
 def test_what_is_no_name_of_a_file_is_refused(path: Any) -> None:
-    for use in (lambda one: write_dng(one, Mosaic(**MOSAIC)), rgbmidic.read_mesh, lambda one: list_frames("*", one)):
+    readers = (rgbmidic.read_mesh, rgbmidic.read_test, rgbmidic.read_frame, Calibration.read, CameraCalibration.read)
+    for use in (
+        lambda one: write_dng(one, Mosaic(**MOSAIC)), lambda one: list_frames("*", one), rgbmidic.Result.open, *readers,
+    ):  # fmt: skip
         with pytest.raises(RgbmidicError):
             use(path)
+
+
+@pytest.mark.parametrize("other", [*STRANGE[:12], object(), Crosstalk])
+@pytest.mark.filterwarnings("ignore")
+def test_an_object_of_another_class_is_refused(tmp_path: Path, other: Any) -> None:
+    for use in (
+        lambda: rgbmidic.export_result(other, "npz", tmp_path / "x"),
+        lambda: Calibration(crosstalk=other),
+        lambda: Calibration(camera_noise=other),
+        lambda: rgbmidic.read_histories(other, ProbeSettings()),
+        lambda: inspect_frame(other),
+    ):
+        with pytest.raises(RgbmidicError):
+            use()
 
 
 def test_grey_levels_that_no_camera_has_are_refused() -> None:

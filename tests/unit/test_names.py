@@ -61,37 +61,41 @@ def summaries(tree: ast.AST) -> Iterator[str]:
 
 
 @cache
-def rooms() -> dict[str, list[tuple[Path, ast.Module]]]:
-    """Modules of every room, read once."""
-    modules_by_room: dict[str, list[tuple[Path, ast.Module]]] = {}
+def modules() -> dict[str, list[Path]]:
+    """Files of every room."""
+    modules_by_room: dict[str, list[Path]] = {}
     for package in (rgbmidic, rgbmidic_calibration):
         root = Path(package.__file__).parent
         for path in sorted(root.rglob("*.py")):
-            folder = path.relative_to(root).parts[:-1]
-            room = "/".join([root.name, *folder[:1]])
-            modules_by_room.setdefault(room, []).append((path, ast.parse(path.read_text(encoding="utf-8"))))
+            modules_by_room.setdefault("/".join([root.name, *path.relative_to(root).parts[:-1][:1]]), []).append(path)
     return modules_by_room
 
 
+@cache
+def trees(room: str) -> list[tuple[Path, ast.Module]]:
+    """Modules of a room, read once."""
+    return [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in modules()[room]]
+
+
 def renamed_rooms() -> list[str]:
-    return sorted(rooms().keys() - PENDING)
+    return sorted(modules().keys() - PENDING)
 
 
 def test_rooms_that_wait_exist() -> None:
-    assert rooms().keys() >= PENDING
+    assert modules().keys() >= PENDING
     assert len(renamed_rooms()) >= 6
 
 
 @pytest.mark.parametrize("room", renamed_rooms())
 def test_few_names_of_a_room_are_riddles(room: str) -> None:
-    names = [(name, path.name) for path, tree in rooms()[room] for name in bound_names(tree)]
+    names = [(name, path.name) for path, tree in trees(room) for name in bound_names(tree)]
     riddles = [f"{file}: {name}" for name, file in names if is_riddle(name)]
     assert len(names) > 100
     assert len(riddles) <= MAX_FRACTION_OF_ROOM * len(names), riddles
 
 
 def test_hardly_any_name_is_a_riddle() -> None:
-    names = [name for room in renamed_rooms() for _, tree in rooms()[room] for name in bound_names(tree)]
+    names = [name for room in renamed_rooms() for _, tree in trees(room) for name in bound_names(tree)]
     riddles = [name for name in names if is_riddle(name)]
     assert len(riddles) <= MAX_FRACTION * len(names), sorted(riddles)
 
@@ -100,7 +104,7 @@ def test_hardly_any_name_is_a_riddle() -> None:
 def test_no_summary_is_a_fragment(room: str) -> None:
     fragments = [
         f"{path.name}: {summary}"
-        for path, tree in rooms()[room]
+        for path, tree in trees(room)
         for summary in summaries(tree)
         if summary.startswith(FRAGMENTS)
     ]
@@ -125,7 +129,7 @@ def quoted_names(tree: ast.AST) -> Iterator[str]:
 def identifiers() -> frozenset[str]:
     """Names that the code has: bound, looked up, imported, keys in quotes, and modules."""
     found = set[str]()
-    for path, tree in (module for modules in rooms().values() for module in modules):
+    for path, tree in (module for room in modules() for module in trees(room)):
         found |= {path.stem, path.parent.name}
         for node in ast.walk(tree):
             found.update(re.findall(r"\w+", str(getattr(node, "asname", None) or getattr(node, "name", ""))))
@@ -151,7 +155,7 @@ def is_defined(name: str) -> bool:
 
 @pytest.mark.parametrize("room", renamed_rooms())
 def test_names_that_docstrings_quote_exist(room: str) -> None:
-    quoted = [(name, path.name) for path, tree in rooms()[room] for name in quoted_names(tree)]
+    quoted = [(name, path.name) for path, tree in trees(room) for name in quoted_names(tree)]
     missing = [f"{file}: {name}" for name, file in quoted if not name.startswith(ELSEWHERE) and not is_defined(name)]
     assert not missing
 

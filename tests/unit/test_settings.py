@@ -213,7 +213,7 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST + "[probes]\ntips = [[1, 2, 60, 30]]", r"probes\.tips .* radii 0 < r0 < r1 in px, not 60 and 30"),
         (
             LEAST + "[probes]\ntips = [[1, 2, 30, 60]]\nplane = 'stress'",
-            r"probes\.tips need probes\.youngs_modulus .* --plane; missing: youngs_modulus, poissons_ratio",
+            r"probes\.tips need probes\.youngs_modulus .*; missing: youngs_modulus, poissons_ratio",
         ),
         (LEAST + "[probes]\nterms = 1", r"probes\.terms must be 0 .* or at least 2, not 1"),
         (LEAST + "[probes]\npoissons_ratio = 0.6", r"probes\.poissons_ratio must be .* 0\.5, not 0\.6"),

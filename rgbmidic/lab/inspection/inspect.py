@@ -15,11 +15,12 @@ from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
-from rgbmidic.illumination.crosstalk import Crosstalk, align
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
-from rgbmidic.illumination.frame_check import Frame, check_state
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
+from rgbmidic.illumination.plane_samples import Frame
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
@@ -174,7 +175,7 @@ def inspect_frame(
     >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
     ('monochrome', True, 0.0)
     """
-    frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
+    frames = tuple(frame) if isinstance(frame, Sequence) else (frame,)
     shape = _require_shape(frames)
     cropped_calibration = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
@@ -194,7 +195,7 @@ def inspect_frame(
     report(1, 3, "lights, and the errors of their separation")
     state, draw = separate_with_errors(linear, cropped_calibration, demosaic, noise)
     state = replace(state, registration=cropped_calibration.registration)
-    images = align(state)
+    images = state.on_first_light()
     report(2, 3, "uncertainty to expect")
     contrasts = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
     index = state.reflection_index()
@@ -302,6 +303,8 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
 
 def _require_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     """Return the rows and columns of frames that can be inspected."""
+    if not (frames and all(isinstance(frame, Mosaic | ChannelFrame) for frame in frames)):
+        raise InputError(f"an inspection needs a frame, or one of each light in succession, not {frames!r:.80}")
     first, shapes = frames[0], {frame.values.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")

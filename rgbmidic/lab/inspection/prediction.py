@@ -103,7 +103,8 @@ def separate_with_errors(
 
         def separate_values(values: FloatImage, cfa: str) -> FloatImage:
             draw_channels = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
-            return np.nan_to_num(separate(draw_channels, calibration, method, texture=model.texture).values)
+            lights = separate(draw_channels, calibration, method, texture=model.texture)
+            return np.nan_to_num(lights.on_first_light().values)
 
         def draw_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
             sites = _draw_sites(model, strength if model.texture.specific < COLOURED else np.ones(3), random)

@@ -22,7 +22,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.frame_check import Frame
+from rgbmidic.illumination.plane_samples import Frame
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.results.files import write_errors
 from rgbmidic.scene.camera import Camera, Light, green_signs, mosaic_samples

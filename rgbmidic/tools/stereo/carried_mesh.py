@@ -18,7 +18,6 @@ from rgbmidic.correlation.solution import rank
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import InputError
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.illumination.crosstalk import align
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure_frame
 from rgbmidic.results import FrameRecord
@@ -191,7 +190,7 @@ def _match(
 ) -> FrameRecord:
     """Match the right reference with the left one: by the search, else from guesses on the epipolar lines."""
     shape = np.maximum(images[0].shape, images[1].shape)
-    first, second = (_padded(align(state), shape) for state in images)
+    first, second = (_padded(state.on_first_light(), shape) for state in images)
     settings = TestSettings(
         frames=FrameSettings(path=()),
         region=RegionSettings(rectangle=(0.0, 0.0, shape[1] - 1.0, shape[0] - 1.0)),

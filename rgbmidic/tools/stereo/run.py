@@ -24,7 +24,6 @@ from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
-from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.source import Series, open_frames
 from rgbmidic.results import Result, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
@@ -35,7 +34,7 @@ from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import carry_mesh
 from rgbmidic.tools.stereo.result import STEREO_FILE, StereoResult, write_stereo
 from rgbmidic.tools.stereo.shape import Shape, nodal_values
-from rgbmidic.typing import AnyArray
+from rgbmidic.typing import AnyArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ class RunOptions(TypedDict, total=False):
     overwrite: bool
     resume: bool
     workers: int | None
-    progress: Progress | None
+    progress: ProgressCallback | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

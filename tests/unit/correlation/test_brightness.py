@@ -7,6 +7,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import Status, correlate
+from rgbmidic._kernels.correlation import corrected_vector, element_vector
 from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.brightness import Brightness, GainFit, gain_and_offset
 from rgbmidic.correlation.constants import USUAL
@@ -60,10 +61,15 @@ def test_a_gain_that_is_linear_is_found_up_to_every_edge(pixels):
     field = (gain * values).astype(np.float32)
     assert np.abs(fit.remainder(field, values)).max() < 0.05 * field.max()
     brightness = Brightness(gain=np.ones(1), offset=np.zeros((1, 3)), fits=(fit,))
-    inverse, border = brightness.inverse_gain(0, values - field, shape, 0.05)
-    top, left = pixels.bounds[:2]
-    found = 1 / inverse[pixels.rows - top + border, pixels.columns - left + border]
-    np.testing.assert_allclose(found, gain, rtol=0.01)
+    inverse = at_pixels(pixels, *brightness.inverse_gain(0, values - field, shape, 0.05))
+    np.testing.assert_allclose(1 / inverse, gain, rtol=0.01)
+
+
+def at_pixels(pixels: PixelMap, scales: np.ndarray, side: int) -> np.ndarray:
+    """Naive interpolation of scales, see `correct_brightness`."""
+    position = (pixels.rows - pixels.bounds[0] + 0.5) / side + 0.5
+    above, columns = position.astype(int), pixels.columns - pixels.bounds[1] + side
+    return scales[above, columns] + (position - above) * (scales[above + 1, columns] - scales[above, columns])
 
 
 def test_an_offset_is_a_plane_whatever_some_elements_show():
@@ -73,27 +79,34 @@ def test_an_offset_is_a_plane_whatever_some_elements_show():
     g = 0.6 * f + plane[:, None]
     g[:15] += 50  # a reflection
     sums = np.stack([np.full(80, 200.0), f.sum(1), g.sum(1), (f * f).sum(1), (f * g).sum(1), (g * g).sum(1)], axis=1)
-    gain, offset = gain_and_offset(sums[None], centres, USUAL)
+    gain, offset = gain_and_offset(sums[None], centres, USUAL.min_gain_correlation)
     assert gain[0] == pytest.approx(0.6, rel=1e-6)
     np.testing.assert_allclose(offset[0, 0] + centres @ offset[0, 1:], plane, atol=0.8)
-    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL)
+    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL.min_gain_correlation)
     assert np.isnan(unlike[0][0])
     np.testing.assert_allclose(unlike[1], [[-f.mean(), 0.0, 0.0]])
 
 
-def test_the_corrected_difference_is_that_of_the_naive_one(pixels):
+@pytest.mark.parametrize("side", [4, 200])
+def test_the_corrected_difference_is_that_of_the_naive_one(pixels, side):
     random = np.random.default_rng(2)
     f, level, before = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
-    scales, offset = random.uniform(0.2, 2, pixels.bounds[2:]).astype(np.float32), np.array([3.0, 0.1, -0.2])
+    (height, width), offset = pixels.bounds[2:], np.array([3.0, 0.1, -0.2])
+    scales = random.uniform(0.2, 2, (-(-height // side) + 2, side * (-(-width // side) + 2))).astype(np.float32)
+    brightness, lines = (f, 1 / level, scales, side, offset), (pixels.lines, pixels.run_offsets)
     difference = before.copy()
-    correct_brightness(pixels.lines, f, 1 / level, scales, 0, offset, difference)
+    correct_brightness(*brightness, *lines, pixels.offsets, difference)
     top, left = pixels.bounds[:2]
     rows, columns = pixels.rows - top, pixels.columns - left
-    a, b = scales[rows, columns], offset[0] + offset[1] * columns + offset[2] * rows
+    a, b = at_pixels(pixels, scales, side), offset[0] + offset[1] * columns + offset[2] * rows
     np.testing.assert_allclose(difference, (f - a * (f - before - b)) / level, rtol=1e-3, atol=1e-3)
+    projected, expected = np.empty((2, len(pixels.origin), 3, 2))
+    corrected_vector(f, before, level, level - 100, *brightness, *lines, *pixels.positions, projected)
+    element_vector(f, difference, level, level - 100, *pixels.positions, expected)
+    np.testing.assert_allclose(projected, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
 def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
     values, weight = np.random.default_rng(3).uniform(0, 1, (2, pixels.columns.size)).astype(np.float32)
-    (found,) = pixels.weighted_block_sums(values[None], weight, 4)
-    np.testing.assert_allclose(found, pixels.block_sums((weight * values)[None], 4)[0], rtol=1e-6)
+    found = pixels.weighted_block_sums(values, weight, 4, with_weight=True)
+    np.testing.assert_allclose(found, pixels.block_sums(np.stack([weight * values, weight]), 4), rtol=1e-6)

@@ -177,7 +177,10 @@ def compared(case, given, weight):
     moments = np.full((len(case.mesh.elements), 6), 7.0)
     kernels.differences(case.coefficients, case.reference, *moved(case), difference)
     images = given, _count_nonuniform_blocks(given), case.reference, difference, weight
-    kernels.warped_weights(*images, *moved(case), found, moments)
+    is_changed = np.empty(len(moments), dtype=bool)
+    kernels.warped_weights(*images, *moved(case), found, moments, is_changed)
+    is_same = ~np.repeat(is_changed, np.diff(case.pixels.offsets))
+    np.testing.assert_array_equal(found[is_same], weight[is_same])
     return difference, found, moments
 
 

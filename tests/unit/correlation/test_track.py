@@ -10,7 +10,7 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Status, Tri3Mesh
 from rgbmidic.correlation import Deformed, NodeStatus, Reference, TrackingState, solve, track
-from rgbmidic.correlation.nodes import torn_elements
+from rgbmidic.correlation.reference import torn_elements
 from rgbmidic.correlation.solution import rank
 from rgbmidic.settings import SolverSettings
 from rgbmidic.weights import Statistics

@@ -97,12 +97,61 @@ def test_in_smooth_motion_the_stated_uncertainty_is_the_error(reach, period):
         assert 0.7 <= np.sqrt(np.mean((error / getattr(found, f"{name}_std"))[3:-3] ** 2)) <= 1.2, name
 
 
+def smooth_step(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A step from 0 to 1 within a phase of 0 to 1, smooth to its second derivative; its integral and derivative."""
+    p = np.clip(phase, 0, 1)
+    integral = p**4 * (2.5 - 3 * p + p**2) + np.maximum(phase - 1, 0)
+    return integral, p**3 * (10 - 15 * p + 6 * p**2), 30 * p**2 * (1 - p) ** 2
+
+
+@pytest.mark.parametrize(
+    ("quantity", "frames", "sizes", "limit"),
+    [
+        ("displacement", 3, (1, 3, 10), 1.25),
+        ("displacement", 3, (30,), 1.6),  # 3.4 without what an onset hides next to a cut
+        ("displacement", 5, (1, 3, 10, 30), 1.25),
+        ("displacement", 10, (1, 3, 10, 30), 1.25),
+        ("strain", 3, (10,), 2.0),  # 2.6 without it; less than 10 times its noise, a step is overlooked
+        ("strain", 5, (3, 10, 30, 100), 1.25),
+        ("strain", 10, (3, 10, 30, 100), 1.25),
+    ],
+)
+def test_while_a_front_passes_its_rate_is_as_far_off_as_stated(quantity, frames, sizes, limit):
+    """A front over so many frames: speeds of the displacement (px/frame), steps of the strain, over their noise."""
+    onset = 15 + np.random.default_rng(0).uniform(0, 1, 40)
+    phase = (EVEN[:, None] - onset) / frames
+    integral, step, slope = smooth_step(phase)
+    motion, rate = (frames * integral, step) if quantity == "displacement" else (step, slope / frames)
+    motion, rate = (np.concatenate([size * part for size in sizes], axis=1) for part in (motion, rate))
+    phase = np.tile(phase, len(sizes))
+    values = motion + np.random.default_rng(frames).normal(size=motion.shape)
+    found = rates(EVEN, values, np.ones(values.shape), window=6, common_fraction=0.0, references=NONE)
+    ratio = (found.velocity - rate) / found.velocity_std
+    for state in (phase < 0, phase > 1):
+        assert 0.75 <= np.sqrt(np.mean(ratio[3:-3][state[3:-3]] ** 2)) <= 1.1
+    assert 0.6 <= np.sqrt(np.mean(ratio[(phase >= 0) & (phase <= 1)] ** 2)) <= limit
+
+
 def test_noise_at_rest_is_hardly_more_than_that_of_one_parabola():
     values, found = measured(0 * EVEN, 0.01, 300, 5)
     weights = np.linalg.pinv(np.arange(-3.0, 4)[:, None] ** np.arange(3))
     lines = np.lib.stride_tricks.sliding_window_view(values, 7, axis=0)
     for name, row in zip(NAMES, (weights[1], 2 * weights[2]), strict=True):
         assert getattr(found, name)[3:-3].std() <= 1.15 * (lines @ row).std()
+
+
+def test_what_a_passing_reflection_adds_is_correlated_from_frame_to_frame():
+    """Eight frames with six times the noise, whose excess has a correlation of .7: 1.4 without regard to it."""
+    random, passing = np.random.default_rng(3), (EVEN > 16) & (EVEN < 25)
+    excess, draws = np.zeros((41, 300)), random.normal(size=(41, 300))
+    for i in np.flatnonzero(passing):
+        excess[i] = 0.7 * excess[i - 1] + (draws[i] if i == 17 else np.sqrt(1 - 0.49) * draws[i])
+    values = random.normal(size=(41, 300)) + np.sqrt(35) * excess
+    std = np.where(passing, 6.0, 1.0)[:, None] * np.ones(300)
+    found = rates(EVEN, values, std, window=6, common_fraction=0.0, references=NONE)
+    ratio = found.velocity / found.velocity_std
+    for state, (low, high) in ((passing, (0.8, 1.2)), (~passing, (0.8, 1.1))):
+        assert low <= np.sqrt(np.mean(ratio[3:-3][state[3:-3]] ** 2)) <= high
 
 
 def test_lost_frames_at_an_onset_make_no_motion_before_it():
@@ -128,7 +177,8 @@ def test_rates_follow_the_units_and_forget_a_uniform_motion():
 
 def test_the_mean_over_pieces_is_that_of_the_naive_sum_over_all_cuts():
     times, random = TIMES[:11], np.random.default_rng(1)
-    for values in (random.normal(size=11), 4.0 * np.maximum(np.arange(11) - 5, 0) + random.normal(size=11)):
+    for speed in (0.0, 4.0, 8.0):
+        values = speed * np.maximum(np.arange(11) - 5.4, 0) + random.normal(size=11)
         found = rates(times, values, np.ones(11), window=3.5, common_fraction=0.0, references=np.zeros(11, dtype=bool))
         expected = np.array([naive_rate(times, values, place, 3.5 * 1.01) for place in range(11)])
         np.testing.assert_allclose(found.velocity, expected[:, 0], atol=2e-3)
@@ -136,7 +186,11 @@ def test_the_mean_over_pieces_is_that_of_the_naive_sum_over_all_cuts():
 
 
 def naive_rate(times: np.ndarray, values: np.ndarray, place: int, reach: float) -> tuple[float, float]:
-    """Velocity at one frame and its uncertainty, over every way to cut the series and every degree of each piece."""
+    """Velocity at one frame and its uncertainty, over every way to cut the series and every degree of each piece.
+
+    Next to a cut the uncertainty holds the rate of an onset: what is hidden in the noise of the last value of a piece
+    and grows by a power of the time to what the next value departs from the tangent by.
+    """
     cuts = [
         (0, *inner, len(times))
         for number in range(len(times) // 3)
@@ -158,13 +212,20 @@ def naive_rate(times: np.ndarray, values: np.ndarray, place: int, reach: float) 
         used = used[used < b]
         if len(used) <= d or not times[used[0]] <= now <= times[used[-1]] or chance / total < 1e-9:
             continue
-        line = np.zeros(len(times))
-        line[used] = np.linalg.pinv((times[used] - now)[:, None] ** np.arange(d + 1.0))[1]
-        found.append((chance / np.linalg.norm(line), line @ values, line))
-    weight, rate, line = (np.array(part) for part in zip(*found, strict=True))
+        line, value_line = np.zeros(len(times)), np.zeros(len(times))
+        value_line[used], line[used] = np.linalg.pinv((times[used] - now)[:, None] ** np.arange(d + 1.0))[:2]
+        onset = 0.0
+        for end, next_one in ((a, a - 1), (b - 1, b)):
+            if place == end and 0 <= next_one < len(times):
+                step = times[next_one] - now
+                tangent = value_line + step * line
+                excess = (values[next_one] - tangent @ values) ** 2 / (tangent @ tangent + 1) - 1
+                onset += (np.log2(1 + np.sqrt(max(excess, 0))) / step) ** 2
+        found.append((chance / np.linalg.norm(line), line @ values, line, onset))
+    weight, rate, line, onset = (np.array(part) for part in zip(*found, strict=True))
     weight /= weight.sum()
     mean = weight @ rate
-    return mean, np.sqrt(((weight @ line) ** 2).sum() + weight @ (rate - mean) ** 2)
+    return mean, np.sqrt(((weight @ line) ** 2).sum() + weight @ ((rate - mean) ** 2 + onset))
 
 
 def evidence(times: np.ndarray, values: np.ndarray, degree: int) -> float:

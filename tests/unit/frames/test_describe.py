@@ -109,7 +109,7 @@ def test_a_frame_is_saved_over_another_only_where_told(tmp_path: Path) -> None:
     frames = _movie(tmp_path / "f.cine")
     settings, out = FrameSettings(path=(str(tmp_path / "f.cine"),)), tmp_path / "frame.tif"
     save_frame(settings, 0, out)
-    with pytest.raises(InputError, match=r"frame\.tif exists already; --overwrite replaces it"):
+    with pytest.raises(InputError, match=r"frame\.tif exists already; `overwrite=True` replaces it"):
         save_frame(settings, 1, out)
     save_frame(settings, 1, out, overwrite=True)
     np.testing.assert_array_equal(tifffile.imread(out), frames[1])

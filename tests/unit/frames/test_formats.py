@@ -411,7 +411,7 @@ MOVIES = ("mp4", "avi", "MOV", "mkv", "wmv")
     [
         *((f"f.{ending}", "demosaiced, so .* no longer the sensor's: give the camera's own file") for ending in MOVIES),
         ("f.jpg", "no raw frame: let the camera record DNG"),
-        ("f.RAW", "header: state its shape and dtype .*frames.shape and frames.dtype, or --shape and --dtype"),
+        ("f.RAW", "header: state its `shape` and `dtype` .*frames.shape and frames.dtype"),
     ],
 )
 def test_a_file_that_is_not_read_says_what_to_do(tmp_path: Path, name: str, advice: str) -> None:

@@ -369,3 +369,21 @@ def test_a_stack_that_is_cut_anywhere_loses_no_frame_in_silence(
     alone = _series(tmp_path / "1.tif")
     with pytest.raises(FrameError, match=r"1\.tif.* truncated"):
         alone.read(len(alone) - 1)
+
+
+@pytest.mark.parametrize("options", [{}, {"rowsperstrip": 7}, {"compression": "zlib"}, {"tile": (16, 16)}], ids=str)
+def test_a_list_of_pages_that_ends_before_the_file_does_is_reported(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = tmp_path / "m.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for frame in FRAMES:
+            writer.write(frame, metadata=None, contiguous=False, photometric="minisblack", **options)
+    assert _series(path).remarks == ()
+    with tifffile.TiffFile(path) as tiff:
+        offsets = [page.offset for page in tiff.pages]
+    content = path.read_bytes()
+    for listed in (1, 5):
+        path.write_bytes(content.replace(struct.pack("<I", offsets[listed]), bytes(4), 1))
+        (remark,) = _series(path).remarks
+        missing, count, frame_bytes = (int(number) for number in re.findall(r"\d+", remark.removeprefix("m.tif")))
+        assert count == listed
+        assert 0.8 < missing / ((6 - listed) * frame_bytes) < 3  # compressed frames differ, pages lie between them

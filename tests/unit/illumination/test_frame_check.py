@@ -16,7 +16,8 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import check_state, contradictions, unevenness
+from rgbmidic.illumination.frame_check import check_state, contradictions
+from rgbmidic.illumination.histogram import unevenness
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.pipeline import measure
 

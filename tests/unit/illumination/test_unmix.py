@@ -1,5 +1,7 @@
 """Unmixing and the entry `separate`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,8 +12,9 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE, Crosstalk, unmix
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
-from rgbmidic.illumination.separation import DEMOSAICERS, separate
+from rgbmidic.illumination.separation import DEMOSAICERS, Separation, separate
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 LIGHTS = ("red", "green", "blue")
@@ -105,3 +108,16 @@ def test_raw_frames_are_separated_by_one_public_call():
     np.testing.assert_array_equal(direct.values, illumination.unmix(illumination.linearise(frame), crosstalk).values)
     with pytest.raises(InputError, match="the calibration has no crosstalk"):
         illumination.separate(mosaic, Calibration())
+
+
+def test_the_public_call_gives_the_images_of_a_measurement_each_light_where_it_lies():
+    values = np.random.default_rng(0).integers(100, 4000, (32, 32)).astype(np.uint16)
+    mosaic = Mosaic(values=values, cfa="RGGB", black_level=64, white_level=4095)
+    registration = replace(
+        Registration.identity(LIGHTS, values.shape), parameters=np.array([[0.0] * 5, [0.4, 0, 0, 1e-3, 0], [0.0] * 5])
+    )
+    calibration = Calibration(crosstalk=Crosstalk(matrix=A, lights=LIGHTS), registration=registration)
+    images, measured = illumination.separate(mosaic, calibration), Separation(calibration=calibration)((mosaic,))
+    np.testing.assert_array_equal(images.values, measured.values)
+    assert images.registration is measured.registration is registration
+    assert (images.on_first_light().values[1] != images.values[1]).any()

@@ -71,12 +71,6 @@ def test_one_thread_does_alone_what_is_small(other, parts):
     assert len(kernel.ranges) == parts
 
 
-def test_numba_is_imported_with_the_first_call_of_a_kernel():
-    code = "import sys, rgbmidic.pipeline, rgbmidic._kernels.render; print({'numba', 'llvmlite'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
 def test_a_failure_in_any_thread_is_told():
     class Failing(Counted):
         def __call__(self, start, stop, other, items):

@@ -39,7 +39,7 @@ def test_a_failed_test_does_not_stop_the_rest_and_a_measured_one_is_kept(small: 
     kept = (out / "first" / "provenance.json").read_bytes()
     table.write_text("test,mesh.element_size\nfirst,30\nlast,40\n")
     other = list(run_batch(read_table(template, table), out))
-    assert [outcome.reason.split(";")[-1] for outcome in other] == ["", " --overwrite measures it again"]
+    assert [outcome.reason.split(";")[-1] for outcome in other] == ["", " `overwrite=True` measures it again"]
     again = list(run_batch(read_table(template, table), out, overwrite=True))
     assert [outcome.measured for outcome in again] == [False, True]
     assert again[0].values == outcomes[0].values

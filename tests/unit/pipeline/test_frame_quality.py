@@ -12,7 +12,7 @@ from small_tests import colour_test
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording
 from rgbmidic.illumination.displacement import LightDisplacement
-from rgbmidic.illumination.frame_check import saturation_pile
+from rgbmidic.illumination.histogram import saturation_pile
 from rgbmidic.illumination.images import IlluminationImages, Registration
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import inspect_frame

@@ -213,7 +213,7 @@ def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(
             assert scheduler.poll() is None
             time.sleep(0.1)
         address = json.loads(where.read_text())["address"]
-        with pytest.raises(RgbmidicError, match=r"no longer answer; .* --resume"):
+        with pytest.raises(RgbmidicError, match=r"no longer answer; .* `resume=True`"):
             measure(settings(movie), tmp_path / "result", scheduler=address, progress=kill)
     finally:
         for process in (scheduler, worker):
@@ -315,11 +315,11 @@ def test_a_source_that_vanishes_stops_the_run_and_fails_no_frame(
     movie: Path, whole: Result, tmp_path: Path, kind: str
 ) -> None:
     folder, out = copied(movie, tmp_path), tmp_path / "result"
-    chosen, told = settings(folder), r"frames are gone: .*f000\.tif and all 36 files.*--resume"
+    chosen, told = settings(folder), r"frames are gone: .*f000\.tif and all 36 files.*`resume=True`"
     if kind == "movie":
         frames = [read_frame(folder / f"f{index:03d}.tif", kind="monochrome").values[0] for index in range(12)]
         np.save(folder / "stack.npy", np.stack(frames))
-        chosen, told = settings(folder, path="stack.npy"), r"frames are gone: .*stack\.npy.*--resume"
+        chosen, told = settings(folder, path="stack.npy"), r"frames are gone: .*stack\.npy.*`resume=True`"
 
     def vanish(done: int, total: int, line: str) -> None:
         if done == 10:
@@ -368,7 +368,7 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     measured: list[str] = []
     result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
     assert (result.frame(33).reason, measured) == ("out of memory", [])
-    with pytest.raises(InputError, match="--retry-failed goes with --resume"):
+    with pytest.raises(InputError, match="`retry_failed` goes with `resume`"):
         measure(settings(movie), tmp_path / "result", retry_failed=True)
     same(measure(settings(movie), tmp_path / "result", resume=True, retry_failed=True), whole)
 
@@ -401,7 +401,7 @@ def test_going_on_with_something_else_is_refused_by_name(movie: Path, whole: Res
         measure(settings(movie, first=1), whole.path, resume=True)
     with pytest.raises(ResultError, match="not a result folder"):
         measure(settings(movie), tmp_path / "nothing", resume=True)
-    with pytest.raises(FrameError, match="--frames names 30 to 39; the test has the frames 0 to 35"):
+    with pytest.raises(FrameError, match="`frames` are 30 to 39; the test has the frames 0 to 35"):
         measure(settings(movie), tmp_path / "nothing", frames=range(30, 40))
     assert not (tmp_path / "nothing").exists()
 

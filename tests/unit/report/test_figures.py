@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -463,12 +461,6 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
     assert not list((tmp_path / "figures").iterdir())
     with pytest.raises(ResultError, match="cannot be written"):
         save_figure(figures.residual_figure(result), tmp_path / "none" / "a.png")
-
-
-def test_matplotlib_is_imported_only_for_a_figure() -> None:
-    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
 
 
 def test_a_picture_appears_when_all_of_it_is_written_and_only_in_a_format_that_there_is(tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ def test_frames_beyond_the_times_of_the_simulation_are_left_out_and_those_asked_
     assert np.median(comparison.frame(3).measured["v"] / comparison.frame(3).simulated["nodes"]["v"]) == pytest.approx(
         1.5, rel=0.01
     )
-    with pytest.raises(InputError, match=r"frame 6 is at 0\.006 s.* spans 0\.001 to 0\.005: state the --offset"):
+    with pytest.raises(InputError, match=r"frame 6 is at 0\.006 s.* spans 0\.001 to 0\.005: state the `offset`"):
         Comparison(result, simulation, PLACEMENT, frames=[2, 6])
     with pytest.raises(InputError, match=r"the frames of .* are at 0 to 0\.006 s"):
         Comparison(result, Simulation.read(states.parent / "all.pvd", offset=1.0), PLACEMENT)
@@ -397,7 +397,7 @@ def option(*words: str) -> Callable[[list[str]], None]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (no_points, "is not known: state two points or more, --points"),
+        (no_points, "is not known: state two points or more, each in mm and in px (--points)"),
         (option("--points", "1,2"), "--points is X_MM,Y_MM:X_PX,Y_PX, such as"),
         (option("--frames", "99"), "there is no frame 99"),
         (option("--frames", "1,0"), "is of the reference, against which nothing has moved"),
@@ -407,7 +407,7 @@ def option(*words: str) -> Callable[[list[str]], None]:
         (option("--fe", "{}"), "the times of the files"),
         (option("--fe", "{}", "--interval", "-1"), "the times of the files"),
         (option("--fe", "{}/step_4.vtu", "--field", "V"), 'no nodal vector "V" (--field); its nodal data: U (3,)'),
-        (option("--fe", "{}/../table.csv"), "state the mesh that they belong to (--mesh FILE)"),
+        (option("--fe", "{}/../table.csv"), "state the --mesh that they belong to"),
         (option("--offset", "7"), "state the --offset between both clocks"),
         (option("--unit", "yard"), "yard"),
         (option("--interval", "1"), "--interval is the time between the files of a folder"),

@@ -160,7 +160,7 @@ def test_nodemaps_have_a_folder_and_millimetres_of_their_own(result: Result, tmp
     with pytest.raises(ResultError, match=r"file already exists and is no folder"):
         export_result(result, "crackpy", tmp_path / "file", scale=scale, overwrite=True)
     export_result(result, "crackpy", out, scale=scale)
-    with pytest.raises(ResultError, match=r"result_\d.txt is already there; .* --overwrite"):
+    with pytest.raises(ResultError, match=r"result_\d.txt is already there; .*`overwrite=True`"):
         export_result(result, "crackpy", out, scale=scale)
     (out / "result_99.txt").write_text("of a longer test before")
     export_result(result, "crackpy", out, scale=scale, overwrite=True)

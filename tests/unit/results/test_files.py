@@ -134,7 +134,9 @@ def test_a_damaged_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.Lo
     content = bytearray(file.read_bytes())
     content[-100] ^= 1
     file.write_bytes(content)
-    with pytest.raises(ResultError, match=r"000001\.npz is damaged in frame 1: its directory .*--resume.*--partial"):
+    with pytest.raises(
+        ResultError, match=r"000001\.npz is damaged in frame 1: its directory .*--resume.*`partial=True`"
+    ):
         _ = Result.open(whole.path).u
     with pytest.raises(ResultError, match=r"000002\.npz is damaged in frame 2: the checksum of u is wrong"):
         Result.open(whole.path).frame(2)

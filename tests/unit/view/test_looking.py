@@ -29,11 +29,12 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.text import format_value, format_with_std
 from rgbmidic.view import curves
-from rgbmidic.view.curves import CurvePanel, FrameProgress, TimeLine
+from rgbmidic.view.curves import CurvePanel
 from rgbmidic.view.fields import FieldsInView, palette_name, range_over_test
 from rgbmidic.view.map_panel import LabelLayer, arrow_lines, contour_lines, place_texts
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import ImageWindow, Overlay, element_at, paint, palette, robust_range
+from rgbmidic.view.time_line import FrameProgress, TimeLine
 from rgbmidic.view.url_state import (
     CLOCKS,
     MARKS,

