@@ -16,8 +16,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.tools.stereo.camera_pair import CameraPair, image_plane
 from rgbmidic.typing import FloatArray
 
-_STEPS = 4
-"""Gauss-Newton steps: from the middle of rays .1 px apart the third changes nothing (measured)."""
+_STEPS = 3
+"""Gauss-Newton steps: with rays 1 px apart the second leaves 2e-7 mm at 400 mm, the third nothing (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
