@@ -7,7 +7,7 @@ rows of its frame, y down the columns, z along the optical axis, away from the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +19,6 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.fields.plane import LENS_PARAMETERS, distorted, undistorted
 from rgbmidic.illumination.calibration import read_document, write_document
-from rgbmidic.illumination.images import Registration
 from rgbmidic.typing import FloatArray, as_numbers
 
 _SCHEMA, _VERSION = "rgbmidic-stereo", 1
@@ -194,25 +193,25 @@ class CameraPair:
                     "of the size of the test's"
                 )
 
-    def check_lights(self, registrations: tuple[Registration | None, Registration | None]) -> None:
+    def check_lights(self, lights: tuple[Sequence[str], Sequence[str]]) -> None:
         """Refuse a test whose first light, in px of whose image it measures, is not that of its camera.
 
         Parameters
         ----------
-        registrations
-            Of the lights of the left and of the right test; None: there is none.
+        lights
+            Names of the lights of the left and of the right test in their order; empty where they are not known.
 
         Raises
         ------
         CalibrationError
             A camera is of the image of another light.
         """
-        for side, camera, registration in zip(("left", "right"), self.cameras, registrations, strict=True):
+        for side, camera, names in zip(("left", "right"), self.cameras, lights, strict=True):
             stated_light = camera.details.get("first_light")
-            if stated_light is not None and registration is not None and registration.lights[0] != stated_light:
+            if stated_light is not None and names and names[0] != stated_light:
                 raise CalibrationError(
                     f"{self.name}: the {side} camera is of light {stated_light}'s image, its test measures in px of "
-                    f"that of light {registration.lights[0]}, the first of its calibration.file"
+                    f"that of light {names[0]}, the first of its calibration.file"
                 )
 
     @classmethod

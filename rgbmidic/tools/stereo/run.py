@@ -111,6 +111,13 @@ class _Test:
         return cls(name=name, settings=settings, series=series, calibration=cropped, result=result)
 
     @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights that the calibration has; none without."""
+        calibration = self.calibration
+        sections = (calibration.crosstalk, calibration.registration) if calibration else ()
+        return next((section.lights for section in sections if section is not None), ())
+
+    @property
     def rate(self) -> float | None:
         """Frames per second that are measured, as TEST.toml or else the camera states it."""
         rate = self.settings.scale.frame_rate or self.series.recording.frame_rate
@@ -243,7 +250,7 @@ def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:
     """Refuse tests that contradict each other or the cameras."""
     left, right = tests
     pair.check((left.series.shape, right.series.shape))
-    pair.check_lights(tuple(test.calibration and test.calibration.registration for test in tests))  # type: ignore[arg-type]
+    pair.check_lights((left.lights, right.lights))
     counts = [len(test.series.selected) for test in tests]
     if counts[0] != counts[1]:
         raise InputError(
