@@ -24,7 +24,7 @@ BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
 
 
-def _block_side(sigma: float) -> int:
+def block_side(sigma: float) -> int:
     """Side (px) of the blocks on which a gain is estimated: the largest power of 2 up to the window's sigma."""
     return int(2 ** np.floor(np.log2(sigma)))
 
@@ -63,7 +63,7 @@ class GainFit:
     @classmethod
     def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
         """Prepare the gain over `values` (P,) with `weights` (P,)."""
-        side = _block_side(sigma)
+        side = block_side(sigma)
         sums, totals = pixels.weighted_block_sums(values, weights, side, with_weight=True)
         total, x, y, xx, xy, yy = _moments(sums, sigma / side, 2)
         # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With

@@ -126,6 +126,13 @@ class SolverConstants:
         Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 noise-free coarse
         speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py). Half or
         twice of it changes displacements by .2 to .5 of their stated uncertainty, in a deep shadow by all of it.
+    max_smooth_fraction
+        Fraction of the squared residual in its means over blocks of that window, from which the light changes within
+        it: edges of shadows 1 to 15 px wide have .29 to .8, highlights that are added .25 to .5, vignetting of coarse
+        speckle .5 to .7, reflections on several lights .1 to .21, plain speckle .01 to .1 (measured).
+    gain_window_ratio
+        The window over the narrower one that follows such a light: plain speckle then errs by 3 % more, a shadow's edge
+        by half (benchmarks/grey_levels.py).
     min_gain_window
         ... and at least, px: one and a half blocks of its grid.
     min_block_side
@@ -159,6 +166,14 @@ class SolverConstants:
         the solution: it changes over some 50 px, and the mean
         of the lights that agree is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger
         on raised droplets.
+    bias_correlation_range
+        Range r (px) of the correlation ``exp(-d^2 / (4 r^2))`` of what the lights' bias leaves at two places a distance
+        d apart: a bias changes over some 50 px, and is seen in a window of `bias_range`. 32 to 36 px fit errors on
+        raised droplets of two renderers under three lights, 47 to 53 px under two lamps in succession (measured).
+    bias_across
+        Fraction of the variance across a direction that is stated in it where no lights agree: an estimate from two or
+        three lights has few degrees of freedom. Without, places that were stated largest on raised droplets erred by .3
+        of that, others by 1.25 times (measured); with twice of it it fits as well.
     local_bias_range
         The same (px) where the bias changes by more than chance within that window: a third of it. Of lights displaced
         within discs of 18 to 50 px by .1 to 1 px (144 of them, at random places) errors are 1.2 times what is stated;
@@ -211,6 +226,8 @@ class SolverConstants:
     min_gain_correlation: float = 0.3
     least_gain: float = 0.05
     gain_window_factor: float = 6.0
+    max_smooth_fraction: float = 0.25
+    gain_window_ratio: float = 3.0
     min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75
@@ -222,6 +239,8 @@ class SolverConstants:
     information_smoothing: float = 0.6
     prior_blocks: float = 0.1
     bias_range: float = 24.0
+    bias_correlation_range: float = 34.0
+    bias_across: float = 0.25
     local_bias_range: float = 8.0
     local_bias_threshold: float = 8.0
 

@@ -382,7 +382,7 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             target[:] = pixels.gather(old.scatter(row))
         return out
 
-    names = "values", "inverse_level", "gradient", "pixel_weights"
+    names = "values", "inverse_level", "gradient", "pixel_weights", "rim"
     fields: dict[str, Any] = {name: resample(getattr(reference, name)) for name in names}
     texture = reference.texture
     fields["texture"] = replace(texture, images=resample(texture.images), texture=resample(texture.texture))

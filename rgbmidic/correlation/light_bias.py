@@ -5,7 +5,8 @@ Noise makes some thousandths of a pixel of it; more is a reflection that does no
 the droplets' flanks. The solution is the mean of the lights by their precision, so it holds some of each light's bias.
 Where lights agree with each other (`rgbmidic.illumination.displacement.consensus_weights`) the others' part is taken
 off the solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose
-biases are independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
+biases are independent; where no lights agree, all are displaced, each to the side of its lamp, and the biases cancel in
+part. Of two lights that disagree nobody knows which is right.
 """
 
 from __future__ import annotations
@@ -53,14 +54,12 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     bias : ndarray, shape (N, 2)
         What is to be added to the displacement, px.
     std : ndarray, shape (N, 5)
-        Standard uncertainty that is left of u, v, exx, eyy and exy: a bias that is alike over the reach of the window
-        changes by so much over it.
+        Standard uncertainty that is left of u, v, exx, eyy and exy: the slopes have that of a field of its correlation.
     """
     nodes, constants, count = table.reference.mesh.nodes, table.reference.constants, len(table.sums)
-    reach = constants.bias_range
     if count == 1:
         return np.zeros_like(nodes), np.zeros((len(nodes), 5))
-    displacement, variance, information = table.displacement(reach)
+    displacement, variance, information = table.displacement(constants.bias_range)
     local, chance, _ = table.displacement(constants.local_bias_range)
     local_change = local - displacement
     gain = np.maximum(1 - constants.local_bias_threshold * chance / np.maximum((local_change**2).sum(axis=1), 1e-30), 0)
@@ -74,7 +73,11 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
     residual_variance = count / (count - 1) * (fractions[:, None] ** 2 * scatter).sum(axis=0)
     residual_variance += ((fractions - precision)[:, None] * local_change).sum(axis=0) ** 2
+    across = constants.bias_across
+    where_none_agree = 2 / (count + 1) * ((1 - across) * residual_variance + across * residual_variance[::-1])
+    residual_variance = consistency * residual_variance + (1 - consistency) * where_none_agree
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
+    reach = np.sqrt(2) * constants.bias_correlation_range
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

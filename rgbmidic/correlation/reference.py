@@ -82,20 +82,23 @@ class Deformed:
             self, "nonuniform_weight_blocks", np.stack([_count_nonuniform_blocks(weight) for weight in self.weights])
         )
 
-    def contains(self, points: FloatArray) -> BoolArray:
-        """Find the points that lie on pixels of the images.
+    def contains(self, points: FloatArray, std: FloatArray) -> BoolArray:
+        """Find the points that lie between pixels of the images, as far as their uncertainty says.
 
         Parameters
         ----------
         points : ndarray, shape (N, 2)
             x and y in px, counted from the first pixel.
+        std : ndarray, shape (N, 2)
+            Their standard uncertainty, px; NaN where not known. Four times of it may be noise, which 1 of 30,000 points
+            on the border exceeds.
 
         Returns
         -------
         ndarray, shape (N,), bool
         """
-        limits = np.array(self.weights.shape[:0:-1]) - 0.5
-        return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
+        margin, limits = 4 * np.nan_to_num(std), np.array(self.weights.shape[:0:-1]) - 1
+        return np.asarray(((points >= -margin) & (points <= limits + margin)).all(axis=1))
 
     def images_on_first_light(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
@@ -190,6 +193,8 @@ class Reference:
         Of each light's local gain with the `pixel_weights`; empty where the gain is one number.
     gradient : ndarray, shape (2, k, P), float32
         Gradient of the texture common to the lights, as each shows it, in local means per px; without what is a gain.
+    rim : ndarray, shape (P,), float32
+        1 at the pixels whose filtered grey level holds some of what lies beyond the region, else 0.
     texture : TextureGradient
         What it is computed from.
     prefilter : str
@@ -221,6 +226,7 @@ class Reference:
     brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
+    rim: FloatImage
     texture: TextureGradient
     prefilter: str
     registration: Registration | None = None
@@ -278,15 +284,16 @@ class Reference:
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
         state = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
-        inside = np.ones(region.mask.shape, dtype=np.float32)
+        inside, unmixed = np.ones(region.mask.shape, dtype=np.float32), usable_pixels(region.mask, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
-            inside *= usable_pixels(region.mask, prefilter)
+            inside *= unmixed
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             inside *= usable_pixels(~rasterise_lines(mesh.nodes[cracks], region.mask.shape), prefilter)
         mapped, assembly, material = aside(PixelMap.from_mesh, mesh, region), Assembly.from_mesh(mesh), material or mesh
         # what each frame needs of it, found while the pixels are
         _ = material.linear_fit_offset, material.colouring
         pixels, (prepared_images, usable) = mapped.result(), state.images_on_first_light(registration)
+        rim = pixels.gather(np.float32(1) - unmixed)
         usable = usable * inside
         if registration is None:
             values, weighted, light_gradient = (
@@ -327,6 +334,7 @@ class Reference:
             brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
+            rim=rim,
             texture=texture,
             prefilter=prefilter,
             registration=registration,
@@ -440,6 +448,24 @@ class Reference:
         )
         fits = local_gain_fits(values, self.pixel_weights, self.pixels, self.gain_window)
         return replace(self, values=values, gain_fits=fits)
+
+    def with_gain_window(self, sigma: float) -> Reference:
+        """Return the reference with a gain that is smooth over a narrower window.
+
+        Parameters
+        ----------
+        sigma
+            Standard deviation of the window, px.
+
+        Returns
+        -------
+        Reference
+        """
+        fits, gradient = local_gain_fits(self.values, self.pixel_weights, self.pixels, sigma), self.gradient.copy()
+        for light, fit in enumerate(fits):
+            for axis in gradient[:, light]:
+                axis[:] = fit.remainder(axis / self.inverse_level[light], self.values[light])
+        return replace(self, gain_fits=fits, gradient=gradient * self.inverse_level)
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
-from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
+from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
@@ -138,6 +138,18 @@ class Residual:
         difference += self.difference
         return replace(self, difference=difference)
 
+    @property
+    def smooth_fraction(self) -> float:
+        """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
+        pixels, window = self.reference.pixels, self.reference.gain_window
+        if window is None:
+            return 0.0
+        smooth, side = 0.0, block_side(window)
+        for residual, weight in zip(self.difference, self.weights, strict=True):
+            sums, total = pixels.weighted_block_sums(residual, weight, side, with_weight=True)
+            smooth += float((sums**2 / np.maximum(total, 1e-30)).sum())
+        return smooth / max(float(self.squares(self.weights)[..., 0].sum()), 1e-300)
+
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
 
@@ -170,6 +182,8 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+    rim_differs
+        The rim of the region shows another body somewhere, which has drawn the residual's displacement.
 
     Examples
     --------
@@ -179,6 +193,7 @@ class Precision:
 
     factor: FloatImage
     loss_curvature: FloatImage
+    rim_differs: bool = False
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.

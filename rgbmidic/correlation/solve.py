@@ -139,11 +139,13 @@ def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, e
 
     Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
     pass in which they do the residual is still that of a wrong match. It is learnt once more where the nodes have moved
-    since.
+    since, and twice where another body at the region's rim has drawn the edge.
     """
     if (matched & ~last.matched).any():
         return number + 1
     constants = last.residual.reference.constants
+    if last.precision is not None and last.precision.rim_differs:
+        return max(last.reweight_until, constants.max_reactivation_passes)
     motion = np.hypot(*(estimate.displacement - last.weighting_displacement).T)[equations.textured]
     has_moved = (
         number == 1 < len(last.residual.weights)
@@ -259,10 +261,8 @@ def _passes(
             problem = replace(problem, reference=reference.filtered_as(estimate.displacement))
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            problem = replace(problem, reference=with_consistent_gradient(weighting.residual, weighting.weights()))
-            if problem.reference is not reference:
-                weighting = replace(weighting, residual=replace(weighting.residual, reference=problem.reference))
-                equations = None
+            problem, weighting = _adapt_reference(problem, weighting, estimate)
+            equations = equations if problem.reference is reference else None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
@@ -275,6 +275,22 @@ def _passes(
             estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, estimate))
     return problem, estimate, equations, weighting
+
+
+def _adapt_reference(problem: Problem, weighting: Weighting, estimate: Estimate) -> tuple[Problem, Weighting]:
+    """Adapt the reference's gradients, and the window of the gain, to what the first pass shows."""
+    constants, residual = problem.constants, weighting.residual
+    adapted = with_consistent_gradient(residual, weighting.weights())
+    if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
+        problem = replace(problem, reference=adapted)
+        return problem, replace(weighting, residual=replace(residual, reference=adapted))
+    assert adapted.gain_window is not None  # without one nothing is smooth
+    narrow = adapted.with_gain_window(adapted.gain_window / constants.gain_window_ratio)
+    problem = replace(problem, reference=narrow)
+    residual, precision = compare(problem, estimate), weighting.precision
+    if problem.method is not None:
+        precision = problem.method.precision(residual)
+    return problem, replace(weighting, residual=residual, precision=precision)
 
 
 @stage("search")
@@ -341,8 +357,9 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     table = BlockTable.of_all(residual, equations.weights)
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
-        step = recovery.field(*gradient_step(weighting.residual, equations).T)
-        std = np.hypot(std, excess_over_chance(step, std, residual, table, equations.weights))
+        step = recovery.value @ gradient_step(weighting.residual, equations)
+        excess = excess_over_chance(step, std[:, :2], residual, table, equations.weights)
+        std = std * np.hypot(1, excess)[:, None]
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         lights = BlockTable.of_lights(residual, equations.weights, problem.constants.min_block_side)
@@ -351,7 +368,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
-    inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
+    positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
+    inside = problem.deformed.contains(positions, std[:, :2])
     node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any() and np.isnan(std[equations.textured]).all():

@@ -242,17 +242,18 @@ def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
 def excess_over_chance(
     step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
 ) -> FloatArray:
-    """Return what the recovered step (N, 5) of `gradient_step` has beyond chance, (N, 5).
+    """Return what the recovered step (N, 2) of `gradient_step` has beyond chance, over the uncertainty, (N,).
 
     Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
-    uncertainty `std` (N, 5) as the scores of what a light alone shows have of all scores, typically. Where a reflection
-    does not follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md).
+    uncertainty as the scores of what a light alone shows have of all scores, typically. Where a reflection does not
+    follow the surface it pulls with them, and what it still pulls without is less than that
+    (docs/explanation/uncertainty.md). A single step is a poor estimate of its variance: both directions have
+    their mean.
 
     Parameters
     ----------
-    step, std : ndarray, shape (N, 5)
-        Of u, v, exx, eyy, exy.
+    step, std : ndarray, shape (N, 2)
+        Of u and v.
     residual, table
         Of the solution.
     weights : ndarray, shape (k, P), float32
@@ -263,6 +264,5 @@ def excess_over_chance(
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
         (images.sums - table.sums[:, :4])[0, :2]
     )
-    square = ((step[:, :2] / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
-    excess = 1 - chance / np.maximum(square, 1e-30)
-    return np.asarray(step * np.sqrt(np.maximum(excess, 0))[:, None])
+    square = ((step / np.maximum(std, 1e-30)) ** 2).mean(axis=1)
+    return np.asarray(np.sqrt(np.maximum(square - chance, 0)))

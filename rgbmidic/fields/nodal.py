@@ -199,7 +199,7 @@ def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
 
 def _windows(nodes: FloatArray) -> sp.csr_matrix:
     """Gaussian windows around places a range of the lights' bias apart, at nodes (N, 2) in px of the image, (N, S)."""
-    at = nodes / USUAL.bias_range
+    at = nodes / USUAL.bias_correlation_range
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     centre_index = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]

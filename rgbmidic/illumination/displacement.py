@@ -140,7 +140,7 @@ def consensus_weights(
         consistency[light] /= np.maximum(1 - precision_fraction[light], 1e-6)
     weights = precision_fraction * (consistency_floor + consistency) ** 2
     weights /= np.maximum(weights.sum(axis=0), 1e-30)
-    return weights, (weights * nearest).sum(axis=0)
+    return weights, np.minimum((weights * nearest).sum(axis=0), 1)
 
 
 def light_displacement(

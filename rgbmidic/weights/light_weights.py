@@ -399,6 +399,11 @@ class Statistics(ValidPixels):
     independent_fraction
         Fraction of its variance that each light's residual is taken to have for itself. Chosen; with half or twice of
         it lights differ by 2e-4 px at most (benchmarks/constants.py).
+    rim_excess
+        Variance at the rim of the region over that inside from which the rim shows another body, such as a background
+        at rest, and has its own: of the some 16 values of a window chance makes 4 times in 1 of 1e7 (derived).
+    min_rim_fraction
+        Fraction of the rim that shows another body from which the weights are learnt anew: half of one side. Chosen.
     window
         In which variances are found.
 
@@ -417,6 +422,8 @@ class Statistics(ValidPixels):
     least_variance: float = 0.1
     rounding: float = 1e-6
     independent_fraction: float = 0.1
+    rim_excess: float = 4.0
+    min_rim_fraction: float = 0.1
     window: SlidingWindow = WINDOW
 
     def precision(self, residual: Residual) -> Precision:
@@ -428,8 +435,10 @@ class Statistics(ValidPixels):
         variance of that mean's residual to the power .75, for it is itself uncertain, times the part of it that
         displaces: brightness and contrast that change slowly leave a residual which the gradient of the speckle
         averages out, blurred noise one that it does not. It holds whatever corrupts the mean there: camera noise,
-        demosaicing, the erratic part of a reflection. Its unit is the median over the region. The pixel's own factor is
-        that of a Student distribution, so that dust or a fragment does not corrupt a node.
+        demosaicing, the erratic part of a reflection. Its unit is the median over the region. The rim, whose filtered
+        grey levels hold some of what lies beyond the region, is judged by itself: beside a background at rest it hardly
+        counts. The pixel's own factor is that of a Student distribution, so that dust or a fragment does not corrupt a
+        node.
 
         Parameters
         ----------
@@ -450,12 +459,23 @@ class Statistics(ValidPixels):
         factor = pixels.from_blocks(_best_fractions(covariance, floor, self.independent_fraction), self.window.step)
         mean, has_weight, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, has_weight)
-        variance, min_variance = self.window.covariance(pixels, mean[None], has_weight[None])[0], floor / len(factor)
-        variance_map = pixels.from_blocks(np.maximum(variance, min_variance), self.window.step)[0]
-        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
+        rim, min_variance = residual.reference.rim, floor / len(factor)
+        variance, rim_variance = (
+            self.window.covariance(pixels, mean[None], counted[None])[0]
+            for counted in (has_weight * (1 - rim), has_weight * rim)
+        )
         unit = max(np.float32(_typical(variance)), min_variance)
+        variance, rim_variance = np.maximum((variance, rim_variance), min_variance)
+        variance_map = pixels.from_blocks(variance, self.window.step)[0]
+        differs, differing_fraction = rim_variance > self.rim_excess * variance, 0.0
+        if differs.any():
+            rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
+            differing_fraction = float((rim_map > variance_map)[rim > 0].mean())
+            np.copyto(variance_map, rim_map, where=rim > 0)
+        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
-        return Precision(factor=factor, loss_curvature=bend)
+        rim_differs = differing_fraction > self.min_rim_fraction
+        return Precision(factor=factor, loss_curvature=bend, rim_differs=rim_differs)
 
 
 def _typical(variance: FloatImage) -> float:

@@ -181,3 +181,33 @@ def test_a_turn_costs_no_iterations(degrees):
     assert found.iterations <= 8
     np.testing.assert_allclose(found.displacement, truth, atol=0.0069)
     np.testing.assert_allclose(found.rigid[1], (0.4, -0.4), atol=0.0016)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, 1.0])
+def test_a_node_beyond_the_last_pixel_is_not_measured(shift):
+    texture, motion = Texture.random(5), Affine(shift=(shift, 0))
+    images = (texture.image(SHAPE, one) + noise for one, noise in zip((None, motion), white_noise(SHAPE), strict=True))
+    found = correlate(*images, element_size=18)
+    last = found.nodes[:, 0] == SHAPE[1] - 1
+    assert found.measured[~last].all()
+    assert found.measured[last].all() == (shift == 0)
+    assert found.measured[last].any() == (shift == 0)
+    assert (found.node_status[last] == NodeStatus.NOT_SEEN).all() == (shift > 0)
+
+
+def test_a_background_at_rest_beside_a_rectangle_does_not_count():
+    shape, inside = (200, 120), np.abs(np.arange(120) - 59.5) < 40
+    images = (
+        np.where(inside, Texture.random(6).image(shape, one), Texture.random(7).image(shape)) + noise
+        for one, noise in zip((None, Affine(shift=(0, 3))), white_noise(shape), strict=True)
+    )
+    found = correlate(*images, region=(19, 10, 100, 189), element_size=20)  # a pixel of it on either side
+    error = found.displacement - (0, 3)
+    assert found.measured.mean() > 0.95
+    assert np.sqrt(np.nanmean(error**2)) < 0.04  # .017 to .023, with the background .075 to .105
+    assert np.sqrt(np.nanmean((error / found.displacement_std) ** 2)) < 1.4
+
+
+def white_noise(shape):
+    """Noise of 2 grey levels of two images."""
+    return np.random.default_rng(1).normal(0, 2, (2, *shape))

@@ -10,6 +10,7 @@ from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.residual import Residual
+from rgbmidic.illumination.displacement import consensus_weights
 
 SHAPE = (192, 192)
 ALBEDO = scenes.speckle(SHAPE, blur=0.9).astype(np.float64)
@@ -46,11 +47,32 @@ def test_lights_that_agree_are_left_as_they_are(number):
 
 
 def test_of_two_lights_that_disagree_nobody_knows_which_is_right():
-    """Half their distance is uncertain, in the direction in which they differ and in its strain."""
+    """Half their distance is uncertain, most of it in the direction in which they differ, and in its strain."""
     together, apart = measured([0, 0]), measured([0, 0.1])
-    np.testing.assert_allclose(np.median(apart.displacement_std[:, 0]), 0.05, rtol=0.15)
-    assert np.median(apart.displacement_std[:, 1]) < 1.5 * np.median(together.displacement_std[:, 1])
+    for right in (0, 0.1):
+        ratio = (apart.displacement - (MOTION + right, 0)) / apart.displacement_std
+        assert abs(np.sqrt(np.mean(ratio**2)) - 1) < 0.15
+    u_std, v_std = np.median(apart.displacement_std, axis=0)
+    assert u_std > 1.5 * v_std
     assert np.nanmedian(apart.strain_std[:, 0]) > 1.5 * np.nanmedian(together.strain_std[:, 0])
+
+
+def test_of_three_lights_of_which_none_agree_the_biases_cancel_in_part():
+    """Half of what independent biases would give, a quarter of it across."""
+    displaced = np.array([0, 0.2, -0.2])
+    found = measured(displaced)
+    weights = np.median(found.light_fraction, axis=0)
+    independent = 3 / 2 * (weights**2 @ (displaced - weights @ displaced) ** 2)
+    stated = np.median(found.displacement_std, axis=0)
+    np.testing.assert_allclose(stated, np.sqrt(independent / 2 * np.array([0.75, 0.25])), rtol=0.15)
+
+
+def test_no_lights_agree_more_than_wholly():
+    """Rounding must not leave a negative part of them that does not agree, whose root is no number."""
+    precision = np.random.default_rng(0).uniform(size=(3, 50, 50))
+    agreement = consensus_weights(np.zeros((3, 2, 50, 50)), np.zeros((3, 50, 50)), precision)[1]
+    assert agreement.max() == 1
+    assert agreement.min() > 1 - 1e-12
 
 
 def test_one_light_has_no_other_to_differ_from():

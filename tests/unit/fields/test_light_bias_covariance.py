@@ -9,7 +9,7 @@ from nodal_tests import COVARIANCE, MESH, nodal_noise
 from rgbmidic.fields import Nodal, NodalCovariance, RigidMotion, StrainGauges, make_probe
 from rgbmidic.mesh import Region, Tri3Mesh
 
-RANGE, DRAWS = 24.0, 300
+RANGE, DRAWS = 34.0, 300
 PLACES = {
     "point": (53.3, 47.1),
     "line": (20, 20, 200, 100),

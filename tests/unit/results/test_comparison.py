@@ -84,7 +84,7 @@ def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, 
 def test_the_lights_bias_is_alike_over_its_range_and_leaves_fewer_degrees_of_freedom(tmp_path):
     mesh = OTHER
     away = ((MESH.nodes[:, None] - MESH.nodes) ** 2).sum(axis=-1)
-    root = np.linalg.cholesky(np.exp(-away / (4 * 24**2)) + 1e-9 * np.eye(NODES))
+    root = np.linalg.cholesky(np.exp(-away / (4 * 34**2)) + 1e-9 * np.eye(NODES))
     bias = 2 * STD * MM * (root @ np.random.default_rng(9).normal(size=(60, NODES, 2)))
     field = 0.05 * stretch(mesh)
     moved = noise(60) + bias + 0.05 * stretch()
