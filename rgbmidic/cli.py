@@ -8,12 +8,13 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
-from rgbmidic import cli_before, cli_fields, cli_measure, cli_results, command
+from rgbmidic import cli_before, cli_fields, cli_measure, cli_results, cli_stereo, command
 from rgbmidic._version import __version__
 
 _GROUPS = {
     "Before a test": cli_before,
     "A test": cli_measure,
+    "Two cameras": cli_stereo,
     "Its result": cli_results,
     "Fields of the result": cli_fields,
 }

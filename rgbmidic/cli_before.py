@@ -88,12 +88,19 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 
 @app.command()
-def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")], out: Out) -> None:
+def virtual(
+    scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")],
+    out: Out,
+    stereo: Annotated[float | None, Option(metavar="DEG", help="Two cameras, so many degrees apart.")] = None,
+) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
-    from rgbmidic.lab.virtual.dataset import write_dataset
+    from rgbmidic.lab.virtual.dataset import write_dataset, write_stereo_dataset
 
     with progress_bar("rendering") as progress:
-        write_dataset(scene, out, progress)
+        if stereo is None:
+            write_dataset(scene, out, progress)
+        else:
+            write_stereo_dataset(scene, out, stereo, progress)
 
 
 @app.command()

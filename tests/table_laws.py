@@ -237,6 +237,17 @@ def _noise(table: Table) -> None:
         between(column(table, name), 90, 99)
 
 
+def _stereo(table: Table) -> None:
+    """Three lamps state their error (of 196 nodes that are correlated); one of them is worse where it counts."""
+    lamps, paint = (np.array([row[table.column(name)] for row in table.rows]) for name in ("lamps", "paint"))
+    three, out_of_plane = lamps == "three lamps", column(table, "out of plane [mm]")
+    for name in ("out of plane: error/stated", "epipolar: error/stated"):
+        between(column(table, name)[three], 0.6, 1.5)
+    shiny = paint == "shiny"
+    if not three.all():
+        assert (out_of_plane[three & shiny] < out_of_plane[~three]).all()
+
+
 LAWS: dict[str, Law] = {
     "areas": _areas,
     "arriving_glare": _arriving_glare,
@@ -259,6 +270,7 @@ LAWS: dict[str, Law] = {
     "star": _star,
     "star_peers": _star_peers,
     "study": _study,
+    "stereo": _stereo,
     "study_causes": _study_causes,
     "study_claims": _study_claims,
     "study_ratios": _study_ratios,

@@ -282,11 +282,59 @@ def camera(
         display.draw_camera(estimate.camera, picture, estimate.residuals)
 
 
+_PAIR_OPTIONS: dict[str, Any] = {
+    "left": Annotated[str, Option(help="Photographs of the target by the left camera.")],
+    "right": Annotated[str, Option(help="Photographs at the same moments by the right camera, in the same order.")],
+    "target": Annotated[str, Option(help="KIND:COLUMNSxROWS:SPACINGmm, as of `camera`.")],
+}
+_PAIR_LIGHTS: dict[str, Any] = {
+    "light": Annotated[list[str] | None, Option(help="NAME of the light of the photographs; once per light.")],
+    "left_calibration": Annotated[
+        Path | None, Option(help="Calibration of the left camera, whose registration counts.")
+    ],
+    "right_calibration": Annotated[Path | None, Option(help="The same of the right camera.")],
+}
+
+
+def _read_pair_lights(options: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the lights of the photographs for either camera, see `command.read_target_lights`."""
+    files = options["left_calibration"], options["right_calibration"]
+    if (files[0] is None) != (files[1] is None):
+        raise ConfigurationError("--left-calibration and --right-calibration belong together: state both")
+    left, right = (
+        command.read_target_lights({"light": options["light"], "calibration": file, "crop_origin": None})
+        for file in files
+    )
+    return left, right
+
+
+@app.command()
+@_writes_file("out", Annotated[Path, Option(help="File of both cameras to write (JSON).")], "stereo.json")
+@command.collect_options("lights", _PAIR_LIGHTS, _read_pair_lights)
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@command.collect_options(
+    "views", _PAIR_OPTIONS, dict, left=command.REQUIRED, right=command.REQUIRED, target=command.REQUIRED
+)
+def stereo(views: Any, user_metadata: Any, lights: Any, out: Path) -> None:
+    """Calibrate two cameras, lenses and relative pose, from simultaneous photographs of a target."""
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.target import Target
+
+    patterns = views["left"], views["right"]
+    estimate = jobs.calibrate_stereo(user_metadata, Target.parse(views["target"]), patterns, lights)
+    estimate.pair.write(out)
+    display.stereo(estimate.pair, out)
+
+
 @app.command()
 @command.collect_options("captures", CAPTURE_OPTIONS, _capture_finder)
+@command.collect_options("views", _PAIR_OPTIONS, dict)
 def check(
-    file: Annotated[Path, Argument(help="Calibration file, or camera file with --distance.")],
+    file: Annotated[
+        Path, Argument(help="Calibration file; camera file with --distance; file of two cameras with --left, --right.")
+    ],
     captures: Any,
+    views: Any,
     together: Annotated[
         list[str] | None, Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
@@ -297,18 +345,26 @@ def check(
     region: Region = None,
     distance: Annotated[
         list[str] | None,
-        Option(help="X0,Y0:X1,Y1=MM: a known distance on the plane of a camera file, between two places in px."),
+        Option(
+            help="X0,Y0:X1,Y1=MM: a known distance on the plane of a camera file, between two places in px. MM: of two "
+            "cameras, between the target's farthest points."
+        ),
     ] = None,
     corner_std: Annotated[float, Option(help="Standard uncertainty of such a place, px.")] = 0.5,
 ) -> None:
     """Check a calibration on captures that were not used to make it; exit status 1 if a limit is exceeded."""
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic.tools.stereo import CameraPair
     from rgbmidic_calibration import display
     from rgbmidic_calibration.verify import check_calibration, check_distances
 
     limits = read_limits(limit or ())
-    if CameraCalibration.is_in(file):
+    if CameraPair.is_in(file):
+        checks = _check_pair(file, captures, views, distance or (), limits)
+    elif any(views.values()):
+        raise ConfigurationError(f"--left, --right and --target are for a file of two cameras, and {file} is none")
+    elif CameraCalibration.is_in(file):
         true_distances = [_distance(text) for text in distance or ()]
         if not true_distances:
             raise ConfigurationError(f"{file} is a camera file: state a known distance, --distance X0,Y0:X1,Y1=MM")
@@ -324,6 +380,31 @@ def check(
     display.verdict(checks)
     if not all(figure.passed for figure in checks):
         raise typer.Exit(1)
+
+
+def _check_pair(file: Path, captures: Any, views: Mapping[str, Any], distances: Sequence[str], limits: Limits) -> Any:
+    """Return the checks of a file of two cameras on photographs of a target."""
+    from rgbmidic.tools.stereo import CameraPair
+    from rgbmidic_calibration import jobs
+    from rgbmidic_calibration.captures import CaptureFiles
+    from rgbmidic_calibration.target import Target
+    from rgbmidic_calibration.verify import check_stereo
+
+    if not all(views.values()):
+        raise ConfigurationError(
+            f"{file} is of two cameras: state photographs of a target, --left, --right and --target"
+        )
+    if len(distances) > 1 or any("=" in text for text in distances):
+        raise ConfigurationError(f"--distance of two cameras is one number in mm, such as 64.03, not {distances[0]!r}")
+    try:
+        distance = float(distances[0].removesuffix("mm")) if distances else None
+    except ValueError:
+        raise ConfigurationError(f"--distance of two cameras is a number in mm, not {distances[0]!r}") from None
+    patterns = zip(("left", "right"), (views["left"], views["right"]), strict=True)
+    settings = captures.args[2]
+    left, right = (CaptureFiles.find(role, pattern, settings) for role, pattern in patterns)
+    pairs, _ = jobs.find_view_pairs((left, right), Target.parse(views["target"]))
+    return check_stereo(CameraPair.read(file), pairs, distance=distance, limits=limits)
 
 
 @app.command()
@@ -375,8 +456,14 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     """Show a calibration or camera file as tables, and in one picture."""
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic.tools.stereo import CameraPair
     from rgbmidic_calibration import display
 
+    if CameraPair.is_in(file):
+        display.stereo(CameraPair.read(file), file, is_written=False)
+        if picture is not None:
+            raise ConfigurationError(f"--picture is for a calibration or camera file; {file} is of two cameras")
+        return
     if CameraCalibration.is_in(file):
         camera = CameraCalibration.read(file)
         display.camera(camera, file, is_written=False)

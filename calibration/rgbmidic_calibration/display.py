@@ -20,6 +20,7 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.report.style import literal, save_figure
 from rgbmidic.text import format_with_std
+from rgbmidic.tools.stereo import PAIR_PARAMETERS, CameraPair
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design, Lamp
@@ -80,6 +81,31 @@ def camera(result: CameraCalibration, file: Path, *, is_written: bool = True) ->
         residual = f"; residual {details['plane']['rms_px']:.3f} px rms" if "plane" in details else ""
         lines.append(f"plane: {result.summary()}{residual}")
     lines.append(f"frames of {result.shape[1]} x {result.shape[0]} px")
+    _print([*lines, _written_line(file) if is_written else escape(str(file))])
+
+
+def stereo(pair: CameraPair, file: Path, *, is_written: bool = True) -> None:
+    """Print both lenses and the relative pose with their standard uncertainty, both verdicts, and the warnings."""
+    details = dict(pair.details)
+    lines: list[str | Table] = list(_warning_lines(details.get("warnings", ())))
+    table = _table("Two cameras", ("parameter", "value", "standard uncertainty"))
+    for name, value, variance in zip(PAIR_PARAMETERS, pair.parameters, np.diag(pair.covariance), strict=True):
+        unit = {"f": " px", "cx": " px", "cy": " px", "rotation": " rad", "translation": " mm"}
+        unit_text = unit.get(name.split("_")[1] if name[0] in "lr" and name[:3] != "rot" else name.split("_")[0], "")
+        if value or variance:
+            table.add_row(name.replace("_", " "), f"{value:.7g}{unit_text}", f"{np.sqrt(variance):.2g}{unit_text}")
+    lines.append(table)
+    if rms := details.get("rms_px"):
+        lines.append(
+            f"{len(details['views'])} views; residual {rms['left']:.3f} px rms left, {rms['right']:.3f} px right"
+        )
+    if held_out := details.get("held_out"):
+        std = held_out.get("relative_length_std", float("nan"))
+        lines.append(
+            f"on {len(held_out['views'])} views held out: epipolar residual {held_out['epipolar_px']:.3f} px rms, "
+            f"a length on the target {format_with_std(100 * held_out['relative_length_error'], 100 * std, '%')} off"
+        )
+    lines.append(pair.summary())
     _print([*lines, _written_line(file) if is_written else escape(str(file))])
 
 

@@ -23,7 +23,8 @@ from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
 from rgbmidic_calibration.registration import RegistrationEstimate, estimate_registration
-from rgbmidic_calibration.target import Target, View, find_views
+from rgbmidic_calibration.stereo import StereoEstimate, ViewPair, estimate_stereo
+from rgbmidic_calibration.target import Target, View, find_view, find_views
 
 
 def calibrate_crosstalk(
@@ -223,6 +224,107 @@ def calibrate_camera(
         details |= {"lights": list(lights.names), "first_light": lights.first}
     residuals = tuple(points for estimate in estimates for points in estimate.residuals)
     return CameraEstimate(camera=replace(camera, details=details), residuals=residuals)
+
+
+def find_view_pairs(
+    files: tuple[CaptureFiles, CaptureFiles],
+    target: Target,
+    lights: tuple[TargetLights | None, TargetLights | None] = (None, None),
+) -> tuple[list[ViewPair], tuple[str, ...]]:
+    """Find the target in the photographs that two cameras took at one time.
+
+    Photographs are paired by their times where the files of both state them, else by number.
+
+    Parameters
+    ----------
+    files
+        Photographs of the left and of the right camera.
+    target
+        What they show.
+    lights
+        Lights under which each camera's were taken.
+
+    Returns
+    -------
+    pairs : list of ViewPair
+    reasons : tuple of str
+        Why other pairs are not used.
+
+    Raises
+    ------
+    CalibrationError
+        The numbers of photographs differ, or their times fit nowhere.
+    """
+    series = files[0].series, files[1].series
+    times = [[one.time_ns(index) for index in range(len(one))] for one in series]
+    if None in times[0] or None in times[1]:
+        if len(series[0]) != len(series[1]):
+            raise CalibrationError(
+                f"--left has {len(series[0])} photographs, --right {len(series[1])}: paired by number, both must have "
+                "as many, of the same moments in the same order"
+            )
+        indices = [(index, index) for index in range(len(series[0]))]
+    else:
+        stamps = [np.array(values, dtype=np.float64) for values in times]
+        delays = np.abs(stamps[1] - stamps[0][:, None])
+        interval = float(np.median(np.diff(stamps[0]))) if len(stamps[0]) > 1 else np.inf
+        nearest = delays.argmin(axis=1)
+        indices = [(row, int(nearest[row])) for row in range(len(nearest)) if delays[row].min() < interval / 4]
+        if not indices:
+            raise CalibrationError(
+                f"no photographs of --left and --right were taken at one time: the nearest are "
+                f"{1e-9 * delays.min():.3g} s apart"
+            )
+    pairs, reasons = list[ViewPair](), list[str]()
+    for numbers in indices:
+        try:
+            views = [
+                _on_first_light(find_view(one.read(index)[0], target, one.name(index)), light)
+                for one, index, light in zip(series, numbers, lights, strict=True)
+            ]
+            pairs.append(ViewPair.of(*views))
+        except CalibrationError as error:
+            reasons.append(str(error))
+    return pairs, tuple(reasons)
+
+
+def calibrate_stereo(
+    user_metadata: FrameSettings,
+    target: Target,
+    patterns: tuple[str, str],
+    lights: tuple[TargetLights | None, TargetLights | None] = (None, None),
+) -> StereoEstimate:
+    """Calibrate two cameras from capture files.
+
+    Parameters
+    ----------
+    user_metadata
+        What is stated of the files.
+    target
+        What they show.
+    patterns
+        Photographs of the left and of the right camera.
+    lights
+        Lights under which each camera's were taken; the lens is then that of the first light's image.
+
+    Returns
+    -------
+    StereoEstimate
+
+    Raises
+    ------
+    CalibrationError
+        The photographs do not allow it.
+    """
+    roles = zip(("left", "right"), patterns, strict=True)
+    left, right = (CaptureFiles.find(role, pattern, user_metadata) for role, pattern in roles)
+    estimate = estimate_stereo(*find_view_pairs((left, right), target, lights))
+    details = {**estimate.pair.details, "provenance": provenance("stereo", [left, right], {})}
+    first, second = (
+        replace(camera, details={} if light is None else {"first_light": light.first})
+        for camera, light in zip(estimate.pair.cameras, lights, strict=True)
+    )
+    return replace(estimate, pair=replace(estimate.pair, left=first, right=second, details=details))
 
 
 def _on_first_light(view: View, lights: TargetLights | None) -> View:

@@ -18,8 +18,10 @@ from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
+from rgbmidic.tools.stereo import CameraPair
 from rgbmidic_calibration.captures import TILE, BlockMeans, Captures, TemporalStack, require_same_camera, tile_means
 from rgbmidic_calibration.registration import estimate_registration
+from rgbmidic_calibration.stereo import ViewPair, verdicts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +45,11 @@ class Limits:
         Observed noise against the predicted one, %.
     distance
         Known distance on the specimen's plane against the measured one, %.
+    length
+        Known distance on a target before two cameras against the triangulated one, %: lengths of the package's own
+        calibration are right to .003 % (tests); a focal length off by .1 % is seen by nothing else.
+    epipolar
+        Epipolar residual of a target's points before two cameras, px rms.
     """
 
     leakage: float = 0.3
@@ -52,6 +59,8 @@ class Limits:
     registration: float = 0.03
     noise: float = 10.0
     distance: float = 0.5
+    length: float = 0.05
+    epipolar: float = 0.1
 
 
 LIMITS = Limits()
@@ -273,6 +282,54 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
     samples = int(clear.sum())
     ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
+
+
+def check_stereo(
+    pair: CameraPair, views: Sequence[ViewPair], *, distance: float | None = None, limits: Limits = LIMITS
+) -> list[Check]:
+    """Check two cameras on views of a target that were not used to calibrate them.
+
+    Parameters
+    ----------
+    pair
+        The cameras under test.
+    views
+        The target seen by both at one time.
+    distance
+        True distance of the target's two farthest points, mm, as a caliper measures it; None: as the target states it.
+    limits
+        What may be left.
+
+    Returns
+    -------
+    list of Check
+        The epipolar residual, and the relative error of the length with the scatter of the views.
+
+    Raises
+    ------
+    CalibrationError
+        The photographs have another size than the cameras', there are none, or the distance is not positive.
+    """
+    if not views:
+        raise CalibrationError("both cameras see the target together in no photograph")
+    pair.check((views[0].left.shape, views[0].right.shape))
+    points = views[0].left.points
+    stated = float(np.linalg.norm(points[:, None] - points, axis=2).max())
+    if distance is not None and not 0.9 * stated < distance < 1.1 * stated:
+        raise CalibrationError(
+            f"the target's farthest points are {stated:g} mm apart by --target; a measured distance is within a tenth "
+            f"of that, not {distance:g} mm"
+        )
+    numbered = [min((view, view.renumbered), key=lambda item: item.rms(pair)) for view in views]
+    figures = verdicts(pair, numbered)
+    true = distance or stated
+    error = (1 + figures["relative_length_error"]) * stated / true - 1
+    text = f"the target's farthest points are {true:g} mm apart: measured {(1 + error) * true:.6g} mm"
+    std = 100 * figures.get("relative_length_std", float("nan"))
+    return [
+        Check("epipolar residual", "", figures["epipolar_px"], limits.epipolar, unit="px"),
+        Check("known length", text, 100 * error, limits.length, std=std, unit="%"),
+    ]
 
 
 def check_distances(

@@ -228,5 +228,5 @@ def compiled(over: str | None = None, **options: Any) -> Callable[[Callable[...,
 
 
 helper = partial(compiled, no_cpython_wrapper=True, forceinline=True)
-"""For a function that only kernels call. It becomes a part of each: of one that stays a function, a kernel just compiled
-calls another copy than one from the cache, and the last bits differ (measured)."""
+"""For a function that only kernels call. It becomes a part of each: of one that stays a function, a kernel just
+compiled calls another copy than one from the cache, and the last bits differ (measured)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import reprlib
 from collections.abc import Sequence
@@ -57,6 +58,16 @@ class Region:
         if not mask.any():
             raise RegionError("the region of interest is empty: no pixel of the image lies in it")
         object.__setattr__(self, "mask", mask)
+
+    def describe(self) -> str:
+        """Return the number of pixels and their checksum: what a result keeps of a region that a script gave.
+
+        Returns
+        -------
+        str
+        """
+        digest = hashlib.sha256(np.packbits(self.mask).tobytes()).hexdigest()[:16]
+        return f"{int(self.mask.sum())} of {self.mask.shape[1]} x {self.mask.shape[0]} px, {digest}"
 
     @property
     def width(self) -> int:

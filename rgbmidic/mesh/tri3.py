@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.mesh import colour_nodes
+from rgbmidic._kernels.mesh import claim_pixels, colour_nodes
 from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
@@ -144,6 +144,27 @@ class Tri3Mesh(Derivable):
     def centre_tree(self) -> cKDTree:
         """Search tree of the `centres`."""
         return cKDTree(self.centres)
+
+    def region(self, shape: tuple[int, int]) -> Region:
+        """Return the pixels that the elements cover.
+
+        Parameters
+        ----------
+        shape
+            Rows and columns of the images.
+
+        Returns
+        -------
+        Region
+
+        Raises
+        ------
+        RegionError
+            The elements cover no pixel of the images.
+        """
+        owner = np.full(shape, -1, dtype=np.int32)
+        claim_pixels(self.nodes, self.elements, owner)
+        return Region.from_mask(owner >= 0)
 
     def submesh(self, nodes: BoolArray) -> Tri3Mesh:
         """Return the mesh of some nodes (N,) and of the elements between them, with their `sizes` in the whole.

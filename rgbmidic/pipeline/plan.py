@@ -166,7 +166,8 @@ class Plan:
     ) -> Plan:
         """Read all that the settings name, except the deformed frames.
 
-        Objects take the place of what the settings name; with any of them frames are read whole.
+        Objects take the place of what the settings name; with a source, weights, or a mesh without its region, frames
+        are read whole.
 
         Parameters
         ----------
@@ -203,10 +204,15 @@ class Plan:
             plane.check(frame)
             plane.check_light(None if calibration is None else calibration.registration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        has_objects = any(item is not None for item in (source, weights, mesh, region))
+        has_objects = source is not None or weights is not None or (mesh is not None and region is None)
         labels = None
         if settings.mesh.file is not None:
             mesh, region, labels = place_mesh(settings, frame)
+        if region is not None and region.mask.shape != frame:
+            height, width = region.mask.shape
+            raise RegionError(
+                f"the region is of frames of {width} x {height} px, the test's have {frame[1]} x {frame[0]}"
+            )
         region, window = region or read_region(settings.region, frame), Window.of_frame(frame)
         if not has_objects and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)

@@ -16,7 +16,7 @@ from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
-from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
@@ -52,6 +52,7 @@ def measure(
     separation: LightSeparation | None = None,
     weights: LightWeights | None = None,
     mesh: Tri3Mesh | None = None,
+    region: Region | None = None,
     overwrite: bool = False,
     resume: bool = False,
     retry_failed: bool = False,
@@ -82,6 +83,8 @@ def measure(
         ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they are used alone.
     mesh
         Mesh in px of the frame, instead of the one made from region and ``[mesh]``.
+    region
+        Pixels to measure, in px of the frame, instead of ``[region]``.
     overwrite
         Replace an existing result.
     resume
@@ -137,8 +140,10 @@ def measure(
     check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
     check_type("frames", frames, range | None, "a range of indices")
     check_type("workers", workers, int | None, "a whole number")
+    check_type("region", region, Region | None, "a Region")
     check_object("progress", progress, "__call__")
     instances: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
+    instances |= {} if region is None else {"region": region}
     has_provenance = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     provenance = read_provenance(Path(out)) if has_provenance else {}
     with collect_messages() as plan_messages:

@@ -226,7 +226,9 @@ def read_provenance(path: Path) -> dict[str, Any]:
     try:
         document = _document(path)
     except FileNotFoundError:
-        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}") from None
+        within = [f"{file.parent}" for file in sorted(path.glob(f"*/{PROVENANCE}"))[:3]]
+        hint = f"; results lie in it: {', '.join(within)}" if within else ""
+        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}{hint}") from None
     if (version := document.get("schema_version")) != SCHEMA_VERSION:
         versions = document.get("versions")
         writer = versions.get("rgbmidic", "?") if isinstance(versions, dict) else "?"

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import stereo_scene
 from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 from textures import Texture
@@ -161,12 +162,22 @@ def strike(folder):
     os.chdir(folder)  # the old one is gone
 
 
+def see_twice(folder):
+    """Frames of a plate and photographs of a target by two cameras; the file of the cameras is made on the page."""
+    shutil.rmtree(folder / "my_result")
+    pair = stereo_scene.pair_of()
+    stereo_scene.write_photographs(folder / "board", pair, 13)
+    stereo_scene.write_tests(folder, pair)
+    (folder / "stereo.json").unlink()
+
+
 PREPARED = {
     "README.md": lambda folder: shutil.rmtree(folder / "my_result"),
     "docs/tutorials/first-steps.md": lambda folder: shutil.rmtree(folder / "my_result"),
     "docs/how-to/compare.md": simulate,
     "docs/how-to/fast-tests.md": interrupt,
     "docs/how-to/movies.md": send_wave,
+    "docs/how-to/stereo.md": see_twice,
     "docs/tutorials/impact.md": strike,
 }
 """What the folder of a page lacks or has besides."""

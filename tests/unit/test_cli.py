@@ -71,9 +71,16 @@ def test_version_and_help(command: Run) -> None:
         status, out, _ = command(*arguments)
         assert status == 0
         headings = [line for line in out.splitlines() if line.endswith(":") and line[0] != " "]
-        assert headings == ["Options:", "Before a test:", "A test:", "Its result:", "Fields of the result:"]
+        assert headings == [
+            "Options:",
+            "Before a test:",
+            "A test:",
+            "Two cameras:",
+            "Its result:",
+            "Fields of the result:",
+        ]
         assert all(word in out for word in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"))
-    for name in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"):
+    for name in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan", "stereo"):
         assert command(name, "-h") == command(name, "--help")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,12 +67,82 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: ProgressCal
         The folder is not empty or cannot be written.
     """
     experiment, out = read_scene(scene_toml), Path(out)
-    scene, settings = experiment.scene, experiment.output
-    _check_output(scene, out)
+    _check_output(experiment.scene, out)
     states = (State(), *experiment.states)
+    test = _write_test(experiment.scene, states, experiment.output, out, progress)
+    shutil.copyfile(scene_toml, out / "scene.toml")
+    return test
+
+
+def write_stereo_dataset(
+    scene_toml: Path | str, out: Path | str, angle_deg: float, progress: ProgressCallback | None = None
+) -> tuple[Path, Path]:
+    """Render the virtual test of a SCENE.toml as two cameras see it, for `rgbmidic stereo`.
+
+    Both cameras stand on a circle about the vertical through the body's front point, as far as the scene's camera.
+    Written to `out`: ``left/`` and ``right/`` with all that `write_dataset` writes, ``stereo.json`` (the true cameras),
+    and ``truth.npz`` (points (3, H, W) and displacement (T, 3, H, W), mm in the left camera's axes, of the material
+    points at the pixels of the left frame 0; NaN where there is none).
+
+    Parameters
+    ----------
+    scene_toml, out, progress
+        As of `write_dataset`.
+    angle_deg
+        Angle between the cameras, half of it on either side of the scene's camera.
+
+    Returns
+    -------
+    left, right : Path
+        The test.toml of either camera.
+
+    Raises
+    ------
+    ConfigurationError
+        The scene file is wrong.
+    InputError
+        The angle is not above 0 and below 120 degrees, or the body spins during the exposure.
+    ResultError
+        The folder is not empty or cannot be written.
+    """
+    from rgbmidic.lab.virtual.view_point import ViewPoint, true_motion, true_pair
+
+    if not 0 < angle_deg < 120:
+        raise InputError(f"cameras stand 0 to 120 degrees apart, not {angle_deg:g}")
+    experiment, out = read_scene(scene_toml), Path(out)
+    scene, states = experiment.scene, (State(), *experiment.states)
+    views = ViewPoint.around(scene, angle_deg / 2), ViewPoint.around(scene, -angle_deg / 2)
+    poses = [[view.state(scene.body, state) for state in states] for view in views]
+    _check_output(scene, out)
+    height, width = scene.camera.shape
+    whole_frame = replace(experiment.output, region=(0.0, 0.0, width - 1.0, height - 1.0))
+    tests = list[Path]()
+    for side, view, seen in zip(("left", "right"), views, poses, strict=True):
+        settings = replace(
+            experiment.output if side == "left" else whole_frame, seed=experiment.output.seed + len(tests)
+        )
+        (out / side).mkdir()
+        tests.append(_write_test(view.scene(scene), seen, settings, out / side, progress))
+    pixels = np.indices(scene.camera.shape, dtype=float)[::-1].reshape(2, -1).T
+    motions = [true_motion(scene, views[0], pixels, state) for state in states]
+    points, displacement = motions[0][0], np.stack([motion for _, motion in motions])
+    _save_arrays(
+        out / "truth.npz",
+        points=np.moveaxis(points, -1, 0).reshape(3, height, width).astype(np.float32),
+        displacement=np.moveaxis(displacement, -1, 1).reshape(-1, 3, height, width).astype(np.float32),
+    )
+    true_pair(scene, *views).write(out / "stereo.json")
+    shutil.copyfile(scene_toml, out / "scene.toml")
+    return tests[0], tests[1]
+
+
+def _write_test(
+    scene: Scene, states: Sequence[State], settings: DatasetSettings, out: Path, progress: ProgressCallback | None
+) -> Path:
+    """Write frames, captures, calibration, truth and settings of a test whose first state is the reference."""
     seeds = np.random.SeedSequence(settings.seed).spawn(5)
     frame_seeds = seeds[0].generate_state(len(states) * len(scene.lights)).reshape(len(states), -1)
-    at_rest = render(scene)
+    at_rest = render(scene, states[0])
     for index, state in enumerate(states):
         images = render(scene, state) if index else at_rest
         for (folder, shining), seed in zip(_folders(scene).items(), frame_seeds[index], strict=False):
@@ -82,7 +152,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: ProgressCal
             _save_arrays(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
         if progress is not None:
             progress(index + 1, len(states), f"frame {index}: turned by {state.angle_deg:g} degrees")
-    displacement = np.stack([truth(scene, state) for state in states])
+    displacement = np.stack([truth(scene, state, states[0]) for state in states])
     _save_arrays(
         out / "truth.npz", displacement=displacement.astype(np.float32), angle_deg=[s.angle_deg for s in states]
     )
@@ -92,7 +162,6 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: ProgressCal
     y, x = np.indices(scene.camera.shape, dtype=float, sparse=True)
     region = settings.region or region_in_view(x, y, displacement, scene.camera.shape)
     test.write_text(settings_text(scene, settings, region), encoding="utf-8")
-    shutil.copyfile(scene_toml, out / "scene.toml")
     return test
 
 

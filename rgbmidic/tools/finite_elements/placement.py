@@ -14,7 +14,6 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -295,6 +294,4 @@ def place_on_image(
             )
     subset = finite_elements.subset(selected)
     mesh = Tri3Mesh(nodes=placement.to_px(subset.points), elements=subset.elements)
-    owner = np.full(shape, -1, dtype=np.int32)
-    claim_pixels(mesh.nodes, mesh.elements, owner)
-    return subset, mesh, Region.from_mask(owner >= 0)
+    return subset, mesh, mesh.region(shape)

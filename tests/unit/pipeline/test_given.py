@@ -37,6 +37,7 @@ NOTHING: Any = object()
             r"weights must be an object that has reference\(\) and def",
         ),
         (lambda: measure(SETTINGS, "out", mesh=NOTHING), "mesh must be a Tri3Mesh, not builtins.object"),
+        (lambda: measure(SETTINGS, "out", region=NOTHING), "region must be a Region, not builtins.object"),
         (lambda: measure(SETTINGS, "out", frames=NOTHING), "frames must be a range"),
         (lambda: measure(SETTINGS, "out", workers=NOTHING), "workers must be a whole number"),
         (lambda: measure(SETTINGS, "out", progress=NOTHING), "progress must be an object that can be called"),

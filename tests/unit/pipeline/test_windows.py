@@ -14,7 +14,8 @@ import pytest
 from small_tests import grey_frame
 from textures import Affine, Texture
 
-from rgbmidic import Calibration, Status, measure, read_test
+from rgbmidic import Calibration, Region, Status, Tri3Mesh, measure, read_test
+from rgbmidic.errors import AnotherTestError, RegionError
 from rgbmidic.frames import Mosaic, Window, write_tiff
 from rgbmidic.frames.data import ChannelFrame, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
@@ -88,6 +89,22 @@ def test_far_motion_is_followed_beyond_the_first_window(tmp_path: Path, settings
     assert (parts.frame_shape, whole.frame_shape, whole.reference_origin) == (SHAPE, SHAPE, (0, 0))
     step = -(-max(rows, columns) // 256)
     assert parts.frame(3).weights_thumbnail.shape[1:] == (-(-rows // step), -(-columns // step))
+
+
+def test_a_mesh_with_its_region_is_measured_in_a_window(tmp_path: Path, settings: Settings) -> None:
+    for index, shift in enumerate([(0.0, 0.0), (3.2, -1.7)]):
+        write_tiff(tmp_path / f"f{index}.tif", grey_frame(3, shift, shape=SHAPE, noise_seed=index))
+    first = measure(settings(), tmp_path / "first")
+    mesh, region = Tri3Mesh(nodes=first.nodes, elements=first.elements), Region.from_rectangle(REGION, SHAPE)
+    elsewhere = settings(region="rectangle = [0, 0, 50, 50]")
+    assert not Plan.from_settings(elsewhere, mesh=mesh, region=region).window.is_whole
+    second = measure(elsewhere, tmp_path / "second", mesh=mesh, region=region)
+    np.testing.assert_allclose(first.u, second.u, atol=1e-12)
+    less = region.without([[(300, 560), (320, 560), (320, 600)]])
+    with pytest.raises(AnotherTestError, match="the input region"):
+        measure(elsewhere, tmp_path / "second", mesh=mesh, region=less, resume=True)
+    with pytest.raises(RegionError, match="the region is of frames of 99 x 99 px"):
+        measure(elsewhere, tmp_path / "third", mesh=mesh, region=Region.from_rectangle((0, 0, 50, 50), (99, 99)))
 
 
 def test_a_search_finds_as_far_as_in_whole_frames(tmp_path: Path, settings: Settings, both: Any) -> None:

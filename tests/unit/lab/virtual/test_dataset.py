@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rgbmidic.errors import ConfigurationError, ResultError
+from rgbmidic.errors import ConfigurationError, InputError, ResultError
 from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import AffineField, MeshField, Polarisers, Sphere, record, render, truth
-from rgbmidic.lab.virtual.dataset import write_dataset
+from rgbmidic.lab.virtual.dataset import write_dataset, write_stereo_dataset
 from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import read_test
+from rgbmidic.tools.stereo import CameraPair
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "scenes"
 
@@ -166,3 +167,20 @@ def test_nothing_is_overwritten(tmp_path):
     with pytest.raises(ConfigurationError, match="not found"):
         write_dataset(tmp_path / "absent.toml", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_two_cameras_see_one_test(tmp_path):
+    """The true points project onto the left pixels, and the true motion onto the motion that either camera sees."""
+    text = SMALL.format(camera="", output="").replace("samples = 3", "samples = 1")
+    path = scene_file(tmp_path, text.replace("calibration_frames = 2", "calibration_frames = 1"))
+    left, right = write_stereo_dataset(path, tmp_path / "out", 20.0)
+    assert read_test(right).region.rectangle == (0, 0, 63, 59)
+    pair = CameraPair.read(tmp_path / "out/stereo.json")
+    assert pair.angle_deg == pytest.approx(20)
+    with np.load(tmp_path / "out/truth.npz") as file, np.load(left.parent / "truth.npz") as of_left:
+        points, moved, seen = file["points"], file["displacement"][1], of_left["displacement"][1]
+    rest, deformed = (pair.project(array.reshape(3, -1).T.astype(float))[0] for array in (points, points + moved))
+    assert rest == pytest.approx(np.indices((60, 64))[::-1].reshape(2, -1).T, abs=1e-2)
+    assert deformed - rest == pytest.approx(seen.reshape(2, -1).T, abs=2e-2)
+    with pytest.raises(InputError, match="not 0"):
+        write_stereo_dataset(path, tmp_path / "none", 0.0)

@@ -1,0 +1,32 @@
+"""Two cameras: shape, motion and strain of a surface in three dimensions.
+
+Each camera's test is an ordinary run. The left mesh is carried over to the right camera once, so that a node is one
+material point in both; both displacements are triangulated frame by frame with their covariances.
+"""
+
+from rgbmidic.tools.stereo.axes import Axes
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart
+from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair
+from rgbmidic.tools.stereo.carried_mesh import CarriedMesh, carry_mesh
+from rgbmidic.tools.stereo.result import QUANTITIES, StereoResult
+from rgbmidic.tools.stereo.run import StereoSettings, measure_stereo
+from rgbmidic.tools.stereo.shape import Shape
+from rgbmidic.tools.stereo.surface import SurfaceGauges
+from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
+
+__all__ = [
+    "PAIR_PARAMETERS",
+    "QUANTITIES",
+    "Axes",
+    "CalibrationPart",
+    "CameraPair",
+    "CarriedMesh",
+    "Shape",
+    "StereoResult",
+    "StereoSettings",
+    "SurfaceGauges",
+    "Triangulation",
+    "carry_mesh",
+    "measure_stereo",
+    "triangulate",
+]
