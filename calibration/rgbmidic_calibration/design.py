@@ -140,7 +140,8 @@ def read_lamp(text: str) -> Lamp:
     if ".csv" in text.lower():
         wavelengths, columns = _read_table(text)
         return MeasuredLamp(wavelengths=wavelengths, values=columns[0])
-    import colour
+    with np.printoptions():  # colour-science sets those of the whole process
+        import colour
 
     spectra = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
     if text not in spectra:

@@ -24,7 +24,8 @@ from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.illumination.images import Registration
-from rgbmidic.mesh.source import Plane, Tri3Mesh
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.source import Plane
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import format_with_std

@@ -375,7 +375,8 @@ class Sensitivities:
         InputError
             There is none of this name.
         """
-        import colour
+        with np.printoptions():  # colour-science sets those of the whole process
+            import colour
 
         cameras = colour.MSDS_CAMERA_SENSITIVITIES
         if name not in cameras:

@@ -297,7 +297,8 @@ DOCTESTS = [path for path in PACKAGES if ">>> " in path.read_text(encoding="utf-
 def test_the_examples_of_the_docstrings_run(path, demo, monkeypatch):
     monkeypatch.chdir(demo)
     name = path.relative_to(ROOT).with_suffix("").as_posix().removeprefix("calibration/").replace("/", ".")
-    found = doctest.testmod(import_module(name))
+    with np.printoptions(legacy=False):  # whatever other tests have imported
+        found = doctest.testmod(import_module(name))
     assert found.attempted
     assert not found.failed
 
