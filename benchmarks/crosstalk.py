@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.lab.virtual import State, strained_plate
+from rgbmidic.tools.lab.virtual import State, strained_plate
 
 from .tables import Row, table
 from .uncertainty import Verdict, rms, solve_pair

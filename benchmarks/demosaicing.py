@@ -1,8 +1,8 @@
 """What each way from a raw frame to the lights costs in displacement error, on scenes with exact truth.
 
-Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white, a
-speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started near the
-truth; errors over the pixels of the field without its border element. Wrinkles of the paint 25 um apart give a smooth
+Scenes of `rgbmidic.tools.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white,
+a speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started near the truth;
+errors over the pixels of the field without its border element. Wrinkles of the paint 25 um apart give a smooth
 reflection, 100 um one that sparkles in spots. Each is traced with as many rays as its reflection needs.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
@@ -27,10 +27,20 @@ from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
-from rgbmidic.scene.camera import PIXEL
+from rgbmidic.tools.lab.virtual import (
+    Scene,
+    State,
+    plate_scene,
+    record,
+    render,
+    sphere_scene,
+    strained_plate,
+    truth,
+    turned,
+)
+from rgbmidic.tools.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 

@@ -21,7 +21,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.results.result_in_units import ResultInUnits, displacements
-from rgbmidic.scene.camera import REFERENCE_CROSSTALK
+from rgbmidic.tools.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray
 
 from .standing_glare import GAIN, READ_NOISE, Paint, expose

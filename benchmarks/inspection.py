@@ -17,13 +17,13 @@ from rgbmidic.illumination import IlluminationImages
 from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.lab.inspection import inspect_frame
-from rgbmidic.lab.virtual import Camera, State, record, render, truth, turned
-from rgbmidic.lab.virtual.rendering import sphere_scene
 from rgbmidic.mesh import Region
-from rgbmidic.scene.forecast import Instrument, trace_change
-from rgbmidic.scene.geometry_weights import GeometryWeights
-from rgbmidic.scene.zones import material_points, predict_zones
+from rgbmidic.tools.lab.inspection import inspect_frame
+from rgbmidic.tools.lab.virtual import Camera, State, record, render, truth, turned
+from rgbmidic.tools.lab.virtual.rendering import sphere_scene
+from rgbmidic.tools.scene.forecast import Instrument, trace_change
+from rgbmidic.tools.scene.geometry_weights import GeometryWeights
+from rgbmidic.tools.scene.zones import material_points, predict_zones
 from rgbmidic.typing import FloatArray, FloatImage
 
 from .demosaicing import NAMED, Case, errors

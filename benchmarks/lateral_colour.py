@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rgbmidic.lab.virtual import strained_plate
-from rgbmidic.lab.virtual.dataset import true_calibration
 from rgbmidic.pipeline import Separation
+from rgbmidic.tools.lab.virtual import strained_plate
+from rgbmidic.tools.lab.virtual.dataset import true_calibration
 
 from .tables import Row, table
 from .uncertainty import Verdict, rms, solve_pair

@@ -23,8 +23,8 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import contradictions
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.lab.virtual import plate_scene, render, sphere_scene
-from rgbmidic.scene.camera import PIXEL
+from rgbmidic.tools.lab.virtual import plate_scene, render, sphere_scene
+from rgbmidic.tools.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 
 from .demosaicing import MEASURED, TILT, painted

@@ -135,7 +135,7 @@ def write_raw_test(folder: Path, frames: int, states: FloatArray, registration: 
     from rgbmidic import Calibration
     from rgbmidic.frames.data import Mosaic
     from rgbmidic.frames.images import write_dng
-    from rgbmidic.lab.virtual import plate_scene, record
+    from rgbmidic.tools.lab.virtual import plate_scene, record
 
     folder.mkdir()
     scene = plate_scene()
@@ -177,7 +177,14 @@ def compiling(test: Path) -> float:
         environment = {**os.environ, "NUMBA_CACHE_DIR": f"{folder}/kernels"}
         taken = [0.0]
         for out in ("first", "second"):
-            command = [sys.executable, "-c", "from rgbmidic.cli import main; main()", "run", str(test), "--no-figures"]
+            command = [
+                sys.executable,
+                "-c",
+                "from rgbmidic.cli.app import main; main()",
+                "run",
+                str(test),
+                "--no-figures",
+            ]
             subprocess.run([*command, "--out", f"{folder}/{out}"], check=True, env=environment, stdout=sys.stderr)
             used = resource.getrusage(resource.RUSAGE_CHILDREN)
             taken.append(used.ru_utime + used.ru_stime)

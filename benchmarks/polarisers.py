@@ -18,12 +18,12 @@ import numpy as np
 
 from rgbmidic import correlate
 from rgbmidic.fields import at_nodes, at_pixels
-from rgbmidic.lab.virtual import Polarisers, Scene, record, render, sphere_scene, truth, turned
-from rgbmidic.lab.virtual.dataset import true_calibration
-from rgbmidic.lab.virtual.rendering import rays_per_pixel
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Separation
-from rgbmidic.scene.camera import PIXEL
+from rgbmidic.tools.lab.virtual import Polarisers, Scene, record, render, sphere_scene, truth, turned
+from rgbmidic.tools.lab.virtual.dataset import true_calibration
+from rgbmidic.tools.lab.virtual.rendering import rays_per_pixel
+from rgbmidic.tools.scene.camera import PIXEL
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 from .tables import Row, table

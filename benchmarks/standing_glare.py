@@ -17,8 +17,8 @@ from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
+from rgbmidic.tools.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics
 

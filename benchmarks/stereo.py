@@ -14,10 +14,10 @@ from rgbmidic import Tri3Mesh, read_frame, separate
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual import Scene, State, record, render, sphere_scene, turned
-from rgbmidic.lab.virtual.dataset import true_calibration, write_frame
-from rgbmidic.lab.virtual.view_point import ViewPoint, true_motion, true_pair
-from rgbmidic.scene.scene import DatasetSettings
+from rgbmidic.tools.lab.virtual import Scene, State, record, render, sphere_scene, turned
+from rgbmidic.tools.lab.virtual.dataset import true_calibration, write_frame
+from rgbmidic.tools.lab.virtual.view_point import ViewPoint, true_motion, true_pair
+from rgbmidic.tools.scene.scene import DatasetSettings
 from rgbmidic.tools.stereo import StereoResult, StereoSettings, measure_stereo
 
 from .tables import Row, table

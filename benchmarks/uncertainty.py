@@ -1,7 +1,7 @@
 """Tables of rendered scenes: whether displacement and stated uncertainty hold without tuning.
 
-Scenes of `rgbmidic.lab.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware) and by an ideal 3-CCD
-one; every setting is the default of `rgbmidic.correlate` with images divided by their local mean (sigma 10 px).
+Scenes of `rgbmidic.tools.lab.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware) and by an ideal
+3-CCD one; every setting is the default of `rgbmidic.correlate` with images divided by their local mean (sigma 10 px).
 "error/stated" is the root mean square of error over stated standard uncertainty of the measured nodes: 1 is right.
 "covered" is the percentage of errors within 1.96 stated standard uncertainties: 95 is right.
 """
@@ -20,8 +20,8 @@ from rgbmidic import Status, correlate, measure_sequence
 from rgbmidic.correlation import Solution
 from rgbmidic.fields import at_nodes, at_pixels, field_rms, high_pass
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.tools.lab.virtual import render, strained_plate, truth
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
-from rgbmidic.lab.virtual.dataset import true_calibration
 from rgbmidic.pipeline import Separation
-from rgbmidic.scene.camera import MEASURED_CROSSTALK, PIXEL, REFERENCE_CROSSTALK
+from rgbmidic.tools.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
+from rgbmidic.tools.lab.virtual.dataset import true_calibration
+from rgbmidic.tools.scene.camera import MEASURED_CROSSTALK, PIXEL, REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 from .demosaicing import TILT, painted

@@ -16,7 +16,7 @@ import numpy as np
 from rgbmidic import Calibration, measure, read_test
 from rgbmidic.fields import at_nodes
 from rgbmidic.frames import Mosaic, write_dng
-from rgbmidic.lab.virtual import State, plate_scene, record, render, strained_plate, truth
+from rgbmidic.tools.lab.virtual import State, plate_scene, record, render, strained_plate, truth
 
 SETTINGS = """
 [frames]

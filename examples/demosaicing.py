@@ -18,7 +18,7 @@ from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import linearise, separate
 from rgbmidic.illumination.linear import LinearMosaic
 from rgbmidic.illumination.separation import DEMOSAICERS
-from rgbmidic.lab.virtual import plate_scene, record, render, strained_plate, truth
+from rgbmidic.tools.lab.virtual import plate_scene, record, render, strained_plate, truth
 
 scene = plate_scene(size=288, seed=5, gloss=1.5, glare="green", tilt_deg=(-8.6, 0.0))
 # wrinkles twice as wide, sampled by few rays: a rough reflection

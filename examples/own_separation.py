@@ -18,7 +18,7 @@ from rgbmidic import TestSettings, measure
 from rgbmidic.fields import at_nodes
 from rgbmidic.frames import Mosaic, cfa_channels
 from rgbmidic.illumination import IlluminationImages, linearise
-from rgbmidic.lab.virtual import State, plate_scene, record, render, strained_plate, truth
+from rgbmidic.tools.lab.virtual import State, plate_scene, record, render, strained_plate, truth
 
 scene = plate_scene(size=192, seed=2)
 states = [State(), strained_plate(shift_px=(1.3, -0.7), strain=0.003)]

@@ -17,7 +17,7 @@ import numpy as np
 from rgbmidic import correlate
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.lab.virtual import State, render, sphere_scene, truth, turned
+from rgbmidic.tools.lab.virtual import State, render, sphere_scene, truth, turned
 from rgbmidic.weights import threshold_weights
 
 scene = sphere_scene(size=288, seed=4, kind="monochrome", crosstalk=None, samples=8)

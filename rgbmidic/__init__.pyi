@@ -8,8 +8,6 @@ from .fields import CameraCalibration as CameraCalibration
 from .frames import read_frame as read_frame
 from .illumination import separate as separate
 from .illumination.calibration import Calibration as Calibration
-from .lab.inspection import Inspection as Inspection
-from .lab.inspection import inspect_frame as inspect_frame
 from .mesh import Region as Region
 from .mesh import Tri3Mesh as Tri3Mesh
 from .pipeline import correlate as correlate
@@ -24,3 +22,5 @@ from .settings import read_test as read_test
 from .tools.finite_elements import FiniteElementMesh as FiniteElementMesh
 from .tools.finite_elements import Placement as Placement
 from .tools.finite_elements import read_mesh as read_mesh
+from .tools.lab.inspection import Inspection as Inspection
+from .tools.lab.inspection import inspect_frame as inspect_frame

@@ -22,7 +22,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "rgbmidic.results": {"Quantity": "ResultQuantity", "shared_part": "common_variance_fraction"},
     "rgbmidic.tools.finite_elements.comparison": {"QUANTITIES": "COMPARED_QUANTITIES", "WAYS": "VARIANTS"},
     "rgbmidic.tools.finite_elements.simulation": {"place": "find_placement", "places_among": "label_indices"},
-    "rgbmidic.report": {"Movie": "FieldMovie"},
+    "rgbmidic.tools.report": {"Movie": "FieldMovie"},
     "rgbmidic.frames": {"Movie": "MovieSource", "known_formats": "frame_formats"},
     "rgbmidic.settings": {"regular": "require_regular_file", "plain": "to_plain"},
     "Deformed": {"pictures": "images_on_first_light", "partial": "nonuniform_weight_blocks"},

@@ -15,7 +15,7 @@ from kernels_of_tests import compiled_in_background
 from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
-from rgbmidic import report
+from rgbmidic.tools import report
 
 _compilation = ExitStack()
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.lab.virtual import rendering
+from rgbmidic.tools.lab.virtual import rendering
 
 SAMPLERS = ("poisson", "normal")
 JITTER = 1e-6

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from rgbmidic._kernels import are_compiled
-from rgbmidic.lab.demo import compile_kernels_in_background
+from rgbmidic.tools.lab.demo import compile_kernels_in_background
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def compiled_in_background() -> Iterator[None]:
 
 def _render_and_fit() -> None:
     from rgbmidic.fields import rates
-    from rgbmidic.lab.virtual import render, sphere_scene
+    from rgbmidic.tools.lab.virtual import render, sphere_scene
 
     scene = sphere_scene(size=8, samples=2)
     render(scene)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.lab.virtual import rendering
+from rgbmidic.tools.lab.virtual import rendering
 
 _VARIABLE = "RGBMIDIC_RENDERS"
 _WORTH = 0.1

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import render
-from rgbmidic.report.document import ReportConstants
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.timing import STAGES
+from rgbmidic.tools.report import render
+from rgbmidic.tools.report.document import ReportConstants
 
 LIGHTS = ("red", "green", "blue")
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20)

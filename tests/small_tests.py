@@ -15,8 +15,8 @@ from textures import Affine, Texture
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual import Scene, plate_scene, record, render, strained_plate, truth
 from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.tools.lab.virtual import Scene, plate_scene, record, render, strained_plate, truth
 
 SHAPE = (144, 144)
 REGION = [16, 16, 128, 128]

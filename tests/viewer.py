@@ -57,7 +57,7 @@ def serving(path: Path, **statement: object) -> Iterator[str]:
     """A viewer in a thread of its own; its address."""
     from tornado.ioloop import IOLoop
 
-    from rgbmidic.view.server import start_server
+    from rgbmidic.tools.view.server import start_server
 
     told: Queue = Queue()
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from rgbmidic import command
+from rgbmidic.cli import command
 from rgbmidic.errors import ConfigurationError, InputError
 
 if TYPE_CHECKING:

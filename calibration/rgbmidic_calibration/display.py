@@ -18,8 +18,8 @@ from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.crosstalk import Crosstalk, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
-from rgbmidic.report.style import literal, save_figure
 from rgbmidic.text import format_with_std
+from rgbmidic.tools.report.style import literal, save_figure
 from rgbmidic.tools.stereo import PAIR_PARAMETERS, CameraPair
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate

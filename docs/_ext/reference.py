@@ -28,8 +28,8 @@ MODULES = [
     "rgbmidic.pipeline",
     "rgbmidic.results",
     "rgbmidic.fields",
-    "rgbmidic.report",
-    "rgbmidic.view",
+    "rgbmidic.tools.report",
+    "rgbmidic.tools.view",
     "rgbmidic.frames",
     "rgbmidic.illumination",
     "rgbmidic.illumination.calibration",
@@ -42,18 +42,18 @@ MODULES = [
     "rgbmidic.tools.finite_elements",
     "rgbmidic.tools.finite_elements.comparison",
     "rgbmidic.tools.finite_elements.simulation",
-    "rgbmidic.scene.scene",
-    "rgbmidic.scene.camera",
-    "rgbmidic.scene.surface",
-    "rgbmidic.scene.geometry_weights",
-    "rgbmidic.scene.speckle",
-    "rgbmidic.scene.zones",
-    "rgbmidic.scene.forecast",
-    "rgbmidic.lab",
-    "rgbmidic.lab.demo",
-    "rgbmidic.lab.inspection",
-    "rgbmidic.lab.planning",
-    "rgbmidic.lab.virtual",
+    "rgbmidic.tools.scene.scene",
+    "rgbmidic.tools.scene.camera",
+    "rgbmidic.tools.scene.surface",
+    "rgbmidic.tools.scene.geometry_weights",
+    "rgbmidic.tools.scene.speckle",
+    "rgbmidic.tools.scene.zones",
+    "rgbmidic.tools.scene.forecast",
+    "rgbmidic.tools.lab",
+    "rgbmidic.tools.lab.demo",
+    "rgbmidic.tools.lab.inspection",
+    "rgbmidic.tools.lab.planning",
+    "rgbmidic.tools.lab.virtual",
     "rgbmidic.tools.stereo",
     "rgbmidic.errors",
     "rgbmidic.typing",
@@ -216,9 +216,9 @@ _STATE = {
 
 def scene() -> str:
     """Sections and keys of SCENE.toml."""
-    from rgbmidic.scene.camera import Camera, Light
-    from rgbmidic.scene.scene import BODIES, DatasetSettings, State
-    from rgbmidic.scene.surface import Finish, Surface
+    from rgbmidic.tools.scene.camera import Camera, Light
+    from rgbmidic.tools.scene.scene import BODIES, DatasetSettings, State
+    from rgbmidic.tools.scene.surface import Finish, Surface
 
     text = "## [body]\n\n" + table(("key", "type", "default", "meaning"), [("`kind`", *_BODY["kind"])])
     for name, kind in BODIES.items():
@@ -307,7 +307,7 @@ def commands(program: str) -> str:
     """Every command of a program with its options, as its own help states them."""
     import typer
 
-    from rgbmidic import cli
+    from rgbmidic.cli import app as cli
     from rgbmidic_calibration import cli as calibrate
 
     group = typer.main.get_command({"rgbmidic": cli.app, "rgbmidic-calibrate": calibrate.app}[program])

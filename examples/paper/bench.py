@@ -29,7 +29,8 @@ from measures import (
 from rgbmidic import Calibration, Region
 from rgbmidic.errors import InputError
 from rgbmidic.illumination import IlluminationImages, separate
-from rgbmidic.lab.virtual import (
+from rgbmidic.pipeline import Separation
+from rgbmidic.tools.lab.virtual import (
     Camera,
     Light,
     Plate,
@@ -44,7 +45,6 @@ from rgbmidic.lab.virtual import (
     render,
     truth,
 )
-from rgbmidic.pipeline import Separation
 
 BENCHES = ("sequential", "bayer")
 """Two white lamps in succession before a monochrome camera, as in the paper; three colours in one Bayer shot. The lamps

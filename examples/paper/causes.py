@@ -17,8 +17,8 @@ from bench import Bench, study_paint
 from measurement import Competitor, displacement_at_pixels
 from rgbmidic.fields import high_pass
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.lab.virtual import Finish, Surface
 from rgbmidic.settings import ELEMENT_SIZE
+from rgbmidic.tools.lab.virtual import Finish, Surface
 
 RADIUS = 100.0
 """px; the paper's disturbed zone has 165."""

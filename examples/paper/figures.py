@@ -17,7 +17,7 @@ from bench import Topography
 from measurement import BLUR, METHODS, PaperStudy, SceneStudy
 from measures import Goniometry
 from rgbmidic.fields import high_pass
-from rgbmidic.report import STYLE, finish_plot
+from rgbmidic.tools.report import STYLE, finish_plot
 
 AREA_COLOURS = ("#1f8fe0", "#2ca25f", "#d9a400", "#e8590c", "#d6279a")
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.report import render
+from rgbmidic.tools.report import render
 
 
 class Page:

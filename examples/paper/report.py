@@ -16,7 +16,7 @@ from measurement import METHODS, PaperStudy, SceneStudy
 from page import Page
 from rgbmidic import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.report import save_figure
+from rgbmidic.tools.report import save_figure
 
 _SCENES = {
     "sequential": "two white lamps in succession, monochrome camera",
@@ -92,7 +92,7 @@ def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
         "deviation over 50 x 100 px of the vertical displacement minus its Gaussian-filtered copy (40 px); the mesh is "
         "TRI3 with 25 px. The paper's methods are as in the paper: linear elements, each light's own gradient, grey "
         "levels as recorded, weights binary; 'our solver' has the same images and masks. Nothing here was adjusted to "
-        "the paper's P: the paint is that of `rgbmidic.lab.virtual.paper_scene`."
+        "the paper's P: the paint is that of `rgbmidic.tools.lab.virtual.paper_scene`."
     )
     page.heading("Statements of the paper and what was measured")
     verdicts = [claim.verdict for claim in claims]

@@ -105,7 +105,7 @@ def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]
 def warn_small_elements(mesh: Tri3Mesh, speckle: float | None, labels: MeshLabels) -> None:
     """Warn of elements of a mesh that are small for the speckle, with the uncertainty to expect.
 
-    It goes with the inverse of the element's side (`rgbmidic.scene.forecast.nodal_variance_factor`).
+    It goes with the inverse of the element's side (`rgbmidic.tools.scene.forecast.nodal_variance_factor`).
     """
     sides = np.sqrt(2 * mesh.areas)
     min_side = SPECKLES * (speckle or 0.0)

@@ -449,7 +449,7 @@ def window_around(points: FloatArray, reach: float, settings: TestSettings, fram
     """Return the window within `reach` of points (N, 2), and what its images depend on.
 
     The separation's local statistics use 96 px around: three standard deviations of their windows with all that is
-    between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
+    between (`rgbmidic.tools.lab.inspection.channels.InspectionConstants`).
     """
     return Window.around_points(points, reach + max(96.0, 3 * settings.weights.blur), frame)
 

@@ -22,7 +22,7 @@ def add_to_core() -> None:
 
 
 def _geometry_weights() -> PrepareWeights:
-    from rgbmidic.scene.geometry_weights import GeometryWeights
+    from rgbmidic.tools.scene.geometry_weights import GeometryWeights
 
     return GeometryWeights.prepare
 

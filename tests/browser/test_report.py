@@ -9,7 +9,7 @@ import pytest
 from results import make_result
 from viewer import MISSING, chromium
 
-from rgbmidic.report import write_report
+from rgbmidic.tools.report import write_report
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 A4 = (595, 842)

@@ -16,7 +16,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.results import Result
 from rgbmidic.settings import read_test
-from rgbmidic.view.setup import SetupPage
+from rgbmidic.tools.view.setup import SetupPage
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 

@@ -12,13 +12,13 @@ import pytest
 from results import NODES, corrupt, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
-from rgbmidic.report import FieldMovie, write_movie
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
-from rgbmidic.view import panels
-from rgbmidic.view.picture import element_at, robust_range
+from rgbmidic.tools.report import FieldMovie, write_movie
+from rgbmidic.tools.view import panels
+from rgbmidic.tools.view.picture import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 RIGHT, LEFT, HOME = "\ue014", "\ue012", "\ue011"

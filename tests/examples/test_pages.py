@@ -28,11 +28,13 @@ from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 from textures import Texture
 
-from rgbmidic import CameraCalibration, TestSettings, cli, cli_before, measure, read_test
-from rgbmidic.command import execute
+from rgbmidic import CameraCalibration, TestSettings, measure, read_test
+from rgbmidic.cli import app as cli
+from rgbmidic.cli import before as cli_before
+from rgbmidic.cli.command import execute
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.demo import run_demo, run_plate, write_plate
-from rgbmidic.lab.virtual import rendering
+from rgbmidic.tools.lab.demo import run_demo, run_plate, write_plate
+from rgbmidic.tools.lab.virtual import rendering
 from rgbmidic_calibration import cli as calibrate
 
 pytestmark = pytest.mark.usefixtures("small_pictures")

@@ -16,8 +16,8 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.tools.scene.scene import read_scene
 
 COPIES = 1000
 """Damaged copies of each file and way of damage."""

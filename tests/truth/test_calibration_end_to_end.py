@@ -6,10 +6,10 @@ import numpy as np
 
 from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
-from rgbmidic.lab.virtual.dataset import dark_frames, target_scene, true_calibration
 from rgbmidic.pipeline import measure
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
+from rgbmidic.tools.lab.virtual import record, render, sphere_scene, truth, turned
+from rgbmidic.tools.lab.virtual.dataset import dark_frames, target_scene, true_calibration
 from rgbmidic_calibration.captures import block_means, stack_frames
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.noise import photon_transfer

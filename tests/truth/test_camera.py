@@ -16,16 +16,16 @@ import pytest
 from target_scene import LENS, SHAPE, imaged, on_plane, pose, random_views, view_of
 from textures import Texture
 
-from rgbmidic import CameraCalibration, command, measure
-from rgbmidic.cli import app
+from rgbmidic import CameraCalibration, measure
+from rgbmidic.cli.app import app, command
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.fields import Rectification
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import write_report
 from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore, export_result
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings, read_test
+from rgbmidic.tools.report import write_report
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 

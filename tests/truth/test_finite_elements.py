@@ -12,8 +12,8 @@ import tifffile
 from textures import Affine, Texture
 
 from rgbmidic import CameraCalibration, Result, Tri3Mesh, measure_sequence
-from rgbmidic.cli import app
-from rgbmidic.command import execute
+from rgbmidic.cli.app import app
+from rgbmidic.cli.command import execute
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
@@ -186,7 +186,7 @@ def test_small_elements_and_bad_input_are_told(
 
 def test_the_set_up_page_draws_the_mesh_of_the_file_and_keeps_its_section(test_file: Path) -> None:
     document = pytest.importorskip("bokeh.document")
-    setup = pytest.importorskip("rgbmidic.view.setup")
+    setup = pytest.importorskip("rgbmidic.tools.view.setup")
     page = setup.SetupPage(document.Document(), setup.Draft.from_path(test_file), [], dark=False)
     page._make_mesh()
     assert len(page._edges.data["xs"]) == len(MESH.elements)

@@ -19,8 +19,8 @@ from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.tools.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.weights.threshold import threshold_weights
 
 DRAWS = 60

@@ -7,7 +7,7 @@ import pytest
 
 from rgbmidic import Tri3Mesh, correlate
 from rgbmidic.fields import at_pixels
-from rgbmidic.lab.virtual import (
+from rgbmidic.tools.lab.virtual import (
     Cylinder,
     Finish,
     Light,
@@ -22,7 +22,7 @@ from rgbmidic.lab.virtual import (
     truth,
     turned,
 )
-from rgbmidic.lab.virtual.rendering import paint
+from rgbmidic.tools.lab.virtual.rendering import paint
 
 FRONT = (0.0, 0.0, 600.0)
 SIZE = 144

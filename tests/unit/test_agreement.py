@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from small_tests import SHAPE, SmallTest, colour_test, grey_frame
 
-from rgbmidic import Calibration, CameraCalibration, Status, cli, correlate, measure, read_frame, read_test
-from rgbmidic.command import execute
+from rgbmidic import Calibration, CameraCalibration, Status, correlate, measure, read_frame, read_test
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import execute
 from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames import open_series
 from rgbmidic.frames.data import Mosaic
@@ -23,9 +24,9 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.metadata import StoredFrame, raw_frame
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
-from rgbmidic.lab.inspection import inspect_files, state_frames
 from rgbmidic.pipeline import Plan
 from rgbmidic.settings import FrameSettings
+from rgbmidic.tools.lab.inspection import inspect_files, state_frames
 from rgbmidic_calibration import cli as calibrate
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "test-file.md"

@@ -22,8 +22,9 @@ from cine_files import write_cine
 from results import corrupt, make_origin, make_result, random_record, smooth_record
 from small_tests import colour_test
 
-from rgbmidic import __version__, cli, report
-from rgbmidic.command import (
+from rgbmidic import __version__
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import (
     FRAME_OPTIONS,
     collect_options,
     execute,
@@ -34,6 +35,7 @@ from rgbmidic.command import (
 )
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
+from rgbmidic.tools import report
 
 TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [40, 40, 160, 120]\n'
 
@@ -225,7 +227,7 @@ def test_a_termination_ends_a_run_in_the_background_of_a_script_too(
 def test_run_passes_everything_on_and_tells_what_came_out(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:
-    monkeypatch.setattr("rgbmidic.report.style.save_figure", lambda _, path: path.touch())
+    monkeypatch.setattr("rgbmidic.tools.report.style.save_figure", lambda _, path: path.touch())
     calls: list[dict[str, Any]] = []
 
     def measure(
@@ -332,7 +334,7 @@ def test_figures_of_any_field(command: Run, tmp_path: Path) -> None:
 
 
 def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rgbmidic.report.style.save_figure", lambda _, path: path.touch())
+    monkeypatch.setattr("rgbmidic.tools.report.style.save_figure", lambda _, path: path.touch())
     result = make_result(tmp_path / "result", frames=4)
     status, printed, _ = command("figures", result.path, "--frames", "0,2")
     assert status == 0
@@ -480,7 +482,7 @@ def test_from_frames_to_export(command: Run, test_file: Path) -> None:
 
 
 def test_installed_command_ends_with_the_status_and_without_traceback(tmp_path: Path) -> None:
-    code = "from rgbmidic.cli import main; main()"
+    code = "from rgbmidic.cli.app import main; main()"
     for extra, traces in (([], False), (["--debug"], True)):
         done = subprocess.run(
             [sys.executable, "-c", code, "run", "none.toml", "--out", str(tmp_path / "out"), *extra],

@@ -23,8 +23,8 @@ LACKS = {
     "rgbmidic": {"typer", "rich", "matplotlib", "colour"},
     ", ".join(f"rgbmidic.{room}" for room in CORE): TOOLS | SLOW,
     "rgbmidic._kernels.render": {"numba", "llvmlite"},
-    "rgbmidic.report": {"matplotlib", "numba"},
-    "rgbmidic.cli, rgbmidic.pipeline.run": {"bokeh", "tornado"},
+    "rgbmidic.tools.report": {"matplotlib", "numba"},
+    "rgbmidic.cli.app, rgbmidic.pipeline.run": {"bokeh", "tornado"},
 }
 """What is not imported with a part, nor with those before it."""
 

@@ -11,8 +11,9 @@ from typing import get_args, get_type_hints
 import pytest
 import typer
 
-from rgbmidic import NodeStatus, Status, cli
-from rgbmidic.command import execute
+from rgbmidic import NodeStatus, Status
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import execute
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings.schema import section_types

@@ -7,7 +7,7 @@ import pytest
 import renders
 from draws import other_draws
 
-from rgbmidic.lab.virtual import Scene, plate_scene, record, render, turned
+from rgbmidic.tools.lab.virtual import Scene, plate_scene, record, render, turned
 
 LEVEL = 400.0
 

@@ -12,8 +12,9 @@ import pytest
 from typer.main import get_command
 
 import rgbmidic
-from rgbmidic import cli, command
-from rgbmidic.command import OnceFilter
+from rgbmidic.cli import app as cli
+from rgbmidic.cli import command
+from rgbmidic.cli.command import OnceFilter
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.settings import TestSettings
 

@@ -19,11 +19,11 @@ from rgbmidic.illumination import linearise
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import Quantity
-from rgbmidic.lab.inspection import inspect_frame
-from rgbmidic.scene.camera import rotation
-from rgbmidic.scene.scene import State
-from rgbmidic.scene.surface import AffineField, MeshField, Surface, height_map
 from rgbmidic.settings import ProbeSettings
+from rgbmidic.tools.lab.inspection import inspect_frame
+from rgbmidic.tools.scene.camera import rotation
+from rgbmidic.tools.scene.scene import State
+from rgbmidic.tools.scene.surface import AffineField, MeshField, Surface, height_map
 from rgbmidic.typing import as_numbers
 
 STRANGE: list[Any] = [

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from results import make_result
 
-from rgbmidic import correlation, frames, mesh, renamed, report, results, weights
+from rgbmidic import correlation, frames, mesh, renamed, results, weights
 from rgbmidic import fields as rgbmidic_fields
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.lab import inspection
-from rgbmidic.tools import finite_elements
+from rgbmidic.tools import finite_elements, report
 from rgbmidic.tools.finite_elements import comparison, simulation
+from rgbmidic.tools.lab import inspection
 
 CLASSES = {
     "IlluminationImages": IlluminationImages,

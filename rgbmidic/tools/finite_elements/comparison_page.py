@@ -13,12 +13,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from rgbmidic.errors import import_optional
-from rgbmidic.report import style
-from rgbmidic.report.figures import select_evenly
-from rgbmidic.report.page import render
 from rgbmidic.results.files import write_complete, write_errors, write_table
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.finite_elements.comparison import COMPARED_QUANTITIES, VARIANTS, Comparison, FrameComparison
+from rgbmidic.tools.report import style
+from rgbmidic.tools.report.figures import select_evenly
+from rgbmidic.tools.report.page import render
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import pytest
 
 from bench import BENCHES, SMALLEST, Bench, lamp_for_reflection
 from rgbmidic.errors import InputError
-from rgbmidic.lab.virtual import Sphere, State, reference_camera
+from rgbmidic.tools.lab.virtual import Sphere, State, reference_camera
 
 
 def mirror_direction(body, camera, pixel, state=None):

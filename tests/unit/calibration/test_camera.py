@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 from target_scene import LENS, SHAPE, TARGET, imaged, on_plane, photo, pose, random_views, view_of
 
-from rgbmidic import command
+from rgbmidic.cli import command
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
 from rgbmidic.frames.data import ChannelFrame, Mosaic

@@ -9,7 +9,7 @@ import pytest
 from calibration_scene import BLACK, GAIN, MATRICES, READ, WHITE, captures, expose, registered_pictures, speckle_target
 from target_scene import imaged, pose, random_views, view_of
 
-from rgbmidic.command import execute
+from rgbmidic.cli.command import execute
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic

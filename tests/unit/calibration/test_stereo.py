@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from target_scene import DISTANCE, LENS, SHAPE, TARGET, imaged, pose
 
-from rgbmidic import CameraCalibration, command
+from rgbmidic import CameraCalibration
+from rgbmidic.cli import command
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff

@@ -18,8 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_files import RealData
 
-from rgbmidic import cli
-from rgbmidic.command import execute
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import execute
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import FrameFormat, FrameSource, StoredFrame, formats, open_series, open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window

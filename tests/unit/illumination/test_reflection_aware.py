@@ -24,8 +24,8 @@ from rgbmidic.illumination.prediction_filters import (
 )
 from rgbmidic.illumination.separation import demosaic, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.scene.camera import MEASURED_CROSSTALK
 from rgbmidic.settings import BAYER_PATTERNS
+from rgbmidic.tools.scene.camera import MEASURED_CROSSTALK
 
 SHAPE = (160, 176)
 

@@ -15,8 +15,8 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
-from rgbmidic.lab.inspection import inspect_files
 from rgbmidic.pipeline import Plan
+from rgbmidic.tools.lab.inspection import inspect_files
 
 LIGHTS = ("red", "green", "blue")
 WHOLE, CROP, CORNER = (600, 800), (150, 170), (630, 450)

@@ -16,9 +16,9 @@ from small_tests import colour_test
 from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual import record
 from rgbmidic.pipeline import Plan, measure, measure_sequence
 from rgbmidic.settings import TestSettings
+from rgbmidic.tools.lab.virtual import record
 
 SIDE, NOISE = 96, 12.0
 PATTERN = gaussian_filter(np.random.default_rng(0).normal(size=(SIDE, SIDE)), 1.5)

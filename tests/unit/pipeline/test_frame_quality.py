@@ -15,7 +15,6 @@ from rgbmidic.illumination.displacement import LightDisplacement
 from rgbmidic.illumination.histogram import saturation_pile
 from rgbmidic.illumination.images import IlluminationImages, Registration
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
 from rgbmidic.pipeline.frame_quality import (
@@ -28,6 +27,7 @@ from rgbmidic.pipeline.frame_quality import (
 )
 from rgbmidic.pipeline.source import SourceSeries
 from rgbmidic.settings import TestSettings
+from rgbmidic.tools.lab.inspection import inspect_frame
 
 SHAPE = (120, 140)
 REGION = Region.from_rectangle((10, 10, 129, 109), SHAPE)

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from results import MESH, NODES, make_origin, make_result
 
-from rgbmidic import cli
-from rgbmidic.command import execute
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.fields import History, Units
 from rgbmidic.fields.history import rate_words
@@ -24,7 +24,6 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import history_figure
 from rgbmidic.results import (
     UNKNOWN_TIME,
     Channels,
@@ -46,6 +45,7 @@ from rgbmidic.settings import (
     ScaleSettings,
     TestSettings,
 )
+from rgbmidic.tools.report import history_figure
 
 NUMBERS = (0, 1, 2, 4, 5, 6, 7, 8)
 """Of the frames: number 3 is lost."""

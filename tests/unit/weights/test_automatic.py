@@ -11,9 +11,9 @@ import pytest
 from bench import lamp_for_reflection
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import linearise
-from rgbmidic.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
 from rgbmidic.mesh import Region
-from rgbmidic.scene.camera import reference_camera
+from rgbmidic.tools.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
+from rgbmidic.tools.scene.camera import reference_camera
 from rgbmidic.weights.threshold import automatic_threshold, threshold_weights
 
 SIZE, SPOT = 300, (80.0, 150.0)

@@ -9,8 +9,8 @@ import pytest
 
 from rgbmidic import Result, Status, measure, read_test
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.lab.virtual.dataset import write_dataset
 from rgbmidic.settings import TestSettings
+from rgbmidic.tools.lab.virtual.dataset import write_dataset
 from rgbmidic.weights.threshold import FALLBACK
 
 SCENE = """

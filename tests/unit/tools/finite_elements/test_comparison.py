@@ -11,8 +11,9 @@ import pytest
 from nodal_tests import MESH, nodal_noise
 from results import make_result
 
-from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, cli, read_mesh
-from rgbmidic.command import execute
+from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.cli import app as cli
+from rgbmidic.cli.command import execute
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.results import FrameRecord, Result

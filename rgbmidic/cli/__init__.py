@@ -1,0 +1,1 @@
+"""The command `rgbmidic`: a file per group of commands, thin, no science."""

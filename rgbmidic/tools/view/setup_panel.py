@@ -1,0 +1,313 @@
+"""Parts of the page that sets a test up: frames, raw and inspected, the drawn region, controls, the run."""
+
+from __future__ import annotations
+
+import base64
+import html
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import bokeh.models as bk
+import cv2
+import numpy as np
+import numpy.typing as npt
+from bokeh.document import Document
+from bokeh.layouts import column, row
+
+from rgbmidic.errors import ResultError
+from rgbmidic.frames.series import open_series
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.mesh import Region
+from rgbmidic.results import Result
+from rgbmidic.settings import ELEMENT_SIZE
+from rgbmidic.tools.lab.inspection import Inspection, inspect_frame
+from rgbmidic.tools.report.page import render
+from rgbmidic.tools.report.style import OKABE_ITO
+from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.picture import Canvas, Picture, columns, grey_picture, stretch_to_uint8
+from rgbmidic.tools.view.test_file_editor import HOLES, MASK, Draft, keep_one_outline, masks_of, rings
+from rgbmidic.tools.view.url_state import Mark, UndoHistory
+from rgbmidic.tools.view.widgets import Controls
+
+RAW = "raw frame"
+
+
+class DraftFrames:
+    """The frames of a test that is being set up.
+
+    Parameters
+    ----------
+    draft
+        The test as far as it is known.
+
+    Attributes
+    ----------
+    series
+        All frames of the source, whatever part of them is chosen.
+    calibration
+        Calibration of the lights; None where none is stated.
+    shape
+        Rows and columns of a frame.
+
+    Raises
+    ------
+    RgbmidicError
+        The frames or the calibration cannot be read as the draft states.
+    """
+
+    def __init__(self, draft: Draft) -> None:
+        file = draft.section("calibration").get("file")
+        calibration = Calibration.read(draft.file.parent / file) if isinstance(file, str) else None
+        self.series = open_series(draft.frames, draft.file.parent, calibration)
+        height, width = self.series.read(0)[0].values.shape[-2:]
+        self.shape = height, width
+        self.calibration = calibration and calibration.cropped(draft.frames.crop_origin, self.shape)
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights as the calibration has them, else as the run names those of monochrome frames."""
+        calibration = self.calibration or Calibration()
+        for section in (calibration.crosstalk, calibration.registration):
+            if section is not None:
+                return tuple(section.lights)
+        count = max(self.series.n_lights, len(self.series.lights))
+        return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
+
+    def read_picture(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
+        """Read a raw frame as a picture (H, W), and where a channel is saturated (H, W)."""
+        frame = self.series.read(index)[0]
+        saturated = frame.values >= frame.white_level
+        return grey_picture(frame), np.asarray(saturated if saturated.ndim == 2 else saturated.any(axis=0))
+
+    def inspect(self, index: int, region: Region, element_size: float) -> Inspection:
+        """Inspect a frame before the test, as `inspect_frame` does."""
+        options: dict[str, Any] = {"region": region, "element_size": element_size, "name": self.series.name(index)}
+        return inspect_frame(self.series.read(index), calibration=self.calibration, **options)
+
+
+def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Picture]:
+    """Return the separated lights and their reflection index by their names, each a picture of the whole frame."""
+    images, (column, row) = inspection.images, map(int, inspection.origin)
+    images_by_name = {
+        f"light: {name}": stretch_to_uint8(values) for name, values in zip(images.names, images.values, strict=True)
+    }
+    if inspection.reflection_index is not None:
+        for name, index in zip(images.names, inspection.reflection_index, strict=True):
+            images_by_name[f"reflection index: {name}"] = np.asarray(
+                255 * np.clip(np.nan_to_num(index), 0, 1), dtype=np.uint8
+            )
+    height, width = images.values.shape[1:]
+    padding = (row, shape[0] - row - height), (column, shape[1] - column - width)
+    return {name: np.pad(image, padding) for name, image in images_by_name.items()}
+
+
+def overview(inspection: Inspection, pictures_by_name: Mapping[str, Picture], raw: Picture) -> str:
+    """Return small pictures in rows, as HTML: the raw frame and the separated lights, their reflection index."""
+    tiles = []
+    for name, picture in ((RAW, raw), *pictures_by_name.items()):
+        height, width = picture.shape
+        size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
+        png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
+        tiles.append((name.replace("reflection index", "index"), base64.b64encode(png.tobytes()).decode()))
+    return render("tiles.html", Path(__file__).parent, across=1 + len(inspection.images.names), tiles=tiles)
+
+
+_COLOURS = list(OKABE_ITO.values())
+"""Of the masks; the first two are those of holes and outline."""
+
+
+class RegionDrawing:
+    """Marks of the region on a canvas, which can be undone, and the lines that they make.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    canvas
+        Plot on which they are set and drawn.
+    marks
+        Marks at first.
+    changed
+        Called when they have changed.
+
+    Attributes
+    ----------
+    light
+        Name of the light of which masks are drawn from now on.
+    """
+
+    def __init__(
+        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], on_change: Callable[[], None]
+    ) -> None:
+        self._document, self._canvas, self._on_change = document, canvas, on_change
+        self.light = ""
+        self._steps, self._hole, self._redraw_pending = UndoHistory(marks), 1, False
+        self._rings = bk.ColumnDataSource(columns("xs ys colour"), name="rings")
+        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
+        canvas.place_marks(marks)
+        canvas.marks.on_change("data", lambda attr, old, new: self._receive_marks())
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The marks."""
+        return self._steps.marks
+
+    def step(self, *, back: bool) -> None:
+        """Return to the marks before the last step, or do it again."""
+        self._canvas.place_marks(self._steps.step(back=back))
+        self.draw()
+
+    def next_hole(self) -> None:
+        """Let the marks of a hole or a mask that are set from now on belong to another one."""
+        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
+        self._hole = max(map(int, numbers), default=0) + 1
+
+    def settle(self) -> None:
+        """Draw the lines of marks that were set just now."""
+        if self._redraw_pending:
+            self.draw()
+
+    def draw(self) -> None:
+        """Draw the lines."""
+        self._redraw_pending = False
+        outline, holes = rings(self.marks)
+        coloured_rings = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
+        for index, light_rings in enumerate(masks_of(self.marks).values()):
+            coloured_rings += [(ring, _COLOURS[2 + index % (len(_COLOURS) - 2)]) for ring in light_rings]
+        closed_rings = [([*ring, *ring[:1]], colour) for ring, colour in coloured_rings]
+        rows = [([x for x, _ in ring], [y for _, y in ring], colour) for ring, colour in closed_rings]
+        self._rings.data = columns("xs ys colour", rows)
+        self._on_change()
+
+    def _receive_marks(self) -> None:
+        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
+
+        A polygon's number is that of the present hole; a round hole is complete with two marks.
+        """
+        previous_keys, marks = {mark.key for mark in self.marks}, list[Mark]()
+        for mark in self._canvas.current_marks:
+            kind, number = mark.kind, self._hole
+            if kind == "round hole":
+                number = 1 + sum(earlier.kind.startswith("round hole ") for earlier in marks) // HOLES["round hole"]
+            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
+            marks.append(replace(mark, kind=kind))
+        if tuple(marks) != self.marks:
+            self.take_marks(
+                keep_one_outline(marks, next((mark.kind for mark in marks if mark.key not in previous_keys), ""))
+            )
+
+    def take_marks(self, marks: tuple[Mark, ...]) -> None:
+        """Take marks as a step that can be undone, and draw their lines."""
+        self._steps.record(marks)
+        self._canvas.place_marks(marks)
+        if not self._redraw_pending:
+            self._redraw_pending = True
+            self._document.add_timeout_callback(self.settle, VIEWER.mark_ms)
+
+
+class SetupControls(Controls):
+    """Controls of the page that sets a test up.
+
+    Parameters
+    ----------
+    draft
+        The test as far as it is known.
+    last
+        Index of the last frame of the source.
+    out
+        Folder of the result.
+    dark
+        Whether the page is dark.
+
+    Attributes
+    ----------
+    side
+        The column left of the frame.
+    """
+
+    def __init__(self, draft: Draft, last_index: int, out: Path, *, dark: bool) -> None:
+        frames = draft.frames
+        super().__init__(last_index, frames.reference[0], dark=dark)
+        wide, size = self.wide, draft.section("mesh").get("element_size", "auto")
+        size = ELEMENT_SIZE if size == "auto" else size
+        self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
+        self.picture = bk.Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide)
+        self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
+        self.mode = self.group("mode", "shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])
+        self.hole = self.group("hole", "what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)
+        labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
+        self.undo, self.redo, self.next_shape, self.clear, self.inspect, self.write = (
+            bk.Button(label=name, name=name.lower(), **wide) for name in labels
+        )
+        self.light = bk.Select(title="Masks are of", name="light", **wide)
+        self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
+        final_frame = last_index if frames.last is None else frames.last
+        frame_values = {"Reference": frames.reference[0], "First": frames.first, "Last": final_frame}
+        self.reference, self.first_frame, self.last_frame = (
+            bk.Spinner(title=title, name=title.lower(), value=number, low=0, high=last_index, step=1, **wide)
+            for title, number in frame_values.items()
+        )
+        if (count := len(frames.reference)) > 1:  # the control has the first of them; another value is one frame
+
+            def update_title(_name: str, _old: object, number: float) -> None:
+                self.reference.title = f"Reference, {count} from" if number == frames.reference[0] else "Reference"
+
+            self.reference.on_change("value", update_title)
+            update_title("value", None, frames.reference[0])
+        calibration = str(draft.section("calibration").get("file", ""))
+        texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
+        self.calibration, self.file, self.out = (
+            bk.TextInput(title=title, name=name, value=text, **wide)
+            for name, (title, text) in zip(("calibration", "file", "out"), texts.items(), strict=True)
+        )
+        self.run_button = bk.Button(label="Run", button_type="primary", **wide)
+        self.run_status, self.tiles = bk.Div(name="ran", **wide), bk.Div(name="tiles", **wide)
+        line = partial(row, sizing_mode="stretch_width")
+        buttons = line(self.undo, self.redo, self.next_shape, self.clear)
+        sizes, numbers = line(self.light, self.size), line(self.reference, self.first_frame, self.last_frame)
+        widgets = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
+        self.side = column(*widgets, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
+
+
+class Run:
+    """``rgbmidic run TEST.toml --out DIR``, going on or at its end; it checks its input and reports errors itself.
+
+    Parameters
+    ----------
+    test
+        The TEST.toml.
+    out
+        Folder of the result.
+    """
+
+    def __init__(self, test: Path, out: Path) -> None:
+        self.out, self._output = out, tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the run
+        command = [sys.executable, "-P", "-m", "rgbmidic.cli.app", "run", str(test), "--out", str(out), "--no-figures"]
+        output = self._output
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+
+    @property
+    def is_running(self) -> bool:
+        """True while the run goes on."""
+        return self._process.poll() is None
+
+    def text(self) -> str:
+        """Return how many frames are measured, with a link to them, or how the run ended, as HTML."""
+        is_running, progress, link = self.is_running, "preparing the reference", ""
+        with suppress(ResultError):
+            result = Result.open(self.out, partial=True, check=False)
+            progress = f"{int(result.finished.sum())} of {len(result)} frames measured"
+            link = '<br><a id="result" href="result">look at the result as it grows</a>'
+        if is_running or not self._process.returncode:
+            return f"{'running' if is_running else 'ended'}: {progress}{link}"
+        self._output.seek(0)
+        lines = [line for line in self._output.read().decode("utf-8", "replace").splitlines() if line.strip()]
+        errors = [line for line in lines if line.startswith("error: ")]
+        return html.escape(f"failed: {[*errors, *lines[-1:], 'it printed nothing'][0]}") + link

@@ -1,0 +1,411 @@
+"""State of the view of a result, as the address of its page holds it: it can be kept and opened again."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Self
+from urllib.parse import urlencode
+
+import bokeh.models as bk
+
+from rgbmidic.fields import MEASURES, Units
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings
+from rgbmidic.tools.view.constants import VIEWER
+
+KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
+"""Probes that can be set with the pointer, and how many places each takes."""
+SCALE = "scale"
+MARKS = (*KINDS, SCALE)
+"""Kinds of marks: those of probes, and two points of a known distance."""
+BACKGROUNDS = ("reference", "deformed")
+EXTRA_FIELDS = ("second", "third", "fourth")
+"""Entries of the view that name fields beside the first."""
+UNCERTAINTY = "uncertainty"
+"""Name of the field beside the first that is its standard uncertainty, whatever that is."""
+PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twilight")
+"""Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
+_CLOCKS = {"offset": "an offset", "trigger": "a trigger", "correlation": "correlation"}
+CLOCKS = tuple(_CLOCKS)
+"""Ways to relate the time of channels to that of the frames."""
+_RANGES = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A place on the reference that belongs to a probe.
+
+    Attributes
+    ----------
+    kind
+        One of `MARKS`; those that take two places take marks of their kind in pairs.
+    x, y
+        Place in px on the reference.
+    name
+        Name of the probe of which it is the first mark; empty: its kind and number.
+    key
+        The same for a mark that is moved or renamed, however many have its values.
+    """
+
+    kind: str
+    x: float
+    y: float
+    name: str = ""
+    key: object = field(default_factory=object, compare=False, repr=False, kw_only=True)
+
+
+class UndoHistory:
+    """Marks, which can be undone and done again; the moves of a mark that is dragged are one step.
+
+    Parameters
+    ----------
+    now
+        Marks at first.
+
+    Attributes
+    ----------
+    now
+        The marks.
+    """
+
+    def __init__(self, marks: tuple[Mark, ...]) -> None:
+        self.marks, self._past, self._future, self._moved_mark = marks, list[Any](), list[Any](), -1
+
+    def record(self, marks: tuple[Mark, ...]) -> None:
+        """Take marks as a step."""
+        changed_indices = [
+            index for index, states in enumerate(zip(self.marks, marks, strict=False)) if states[0] != states[1]
+        ]
+        is_single_change = len(marks) == len(self.marks) and len(changed_indices) == 1
+        moved_index = (
+            changed_indices[0]
+            if is_single_change
+            and replace(marks[changed_indices[0]], x=0, y=0) == replace(self.marks[changed_indices[0]], x=0, y=0)
+            else -1
+        )
+        if moved_index < 0 or moved_index != self._moved_mark:
+            self._past = [*self._past[-VIEWER.undo_steps :], self.marks]
+        self.marks, self._future, self._moved_mark = marks, [], moved_index
+
+    def step(self, *, back: bool) -> tuple[Mark, ...]:
+        """Return to the marks before the last step, or do again the one that was undone last."""
+        source, target = (self._past, self._future) if back else (self._future, self._past)
+        if source:
+            target.append(self.marks)
+            self.marks, self._moved_mark = source.pop(), -1
+        return self.marks
+
+
+def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
+    """Return the marks of each complete probe by its name, else kind and number: those of a kind in the order set."""
+    marks_by_name: dict[str, list[Mark]] = {}
+    for kind, count in KINDS.items():
+        of_kind = [mark for mark in marks if mark.kind == kind]
+        for number in range(len(of_kind) // count):
+            name = of_kind[number * count].name
+            has_default_name = not name or name in marks_by_name
+            marks_by_name[f"{kind}_{number + 1}" if has_default_name else name] = of_kind[
+                number * count : (number + 1) * count
+            ]
+    return marks_by_name
+
+
+def probe_position(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
+    """Return the numbers that place the probe of some marks, as ``[probes]`` has them; strain gauges of a length."""
+    coordinates = [coordinate for mark in marks for coordinate in (mark.x, mark.y)]
+    if marks[0].kind == "strain_gauge":
+        return (*coordinates, gauge)
+    if marks[0].kind == "circle":
+        return (*coordinates[:2], math.dist(coordinates[:2], coordinates[2:]))
+    return tuple(coordinates)
+
+
+def settings_of_marks(
+    marks: Sequence[Mark], gauge: float, defaults: ProbeSettings, measure: Any = None
+) -> ProbeSettings:
+    """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
+
+    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `defaults`.
+    """
+    positions: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
+    names = []
+    for name, group in probe_marks(marks).items():
+        positions[f"{group[0].kind}s"] += (probe_position(group, gauge),)
+        if name == group[0].name:
+            names.append((f"{group[0].kind}_{len(positions[f'{group[0].kind}s'])}", name))
+    return ProbeSettings(measure=measure or defaults.measure, window=defaults.window, names=tuple(names), **positions)
+
+
+def marks_of_probes(settings: ProbeSettings) -> tuple[Mark, ...]:
+    """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
+    marks, names = [], dict(settings.names)
+    for default_name, (kind, position) in zip(settings.labels, settings.kind_coordinates, strict=True):
+        if kind not in KINDS:
+            continue
+        x, y, *second_point = position
+        marks.append(Mark(kind, x, y, names.get(default_name, "")))
+        if KINDS[kind] > 1:
+            marks.append(
+                Mark(kind, x + second_point[0], y) if kind == "circle" else Mark(kind, second_point[0], second_point[1])
+            )
+    return tuple(marks)
+
+
+def common_gauge(settings: ProbeSettings) -> float | None:
+    """Return the length of the strain gauges stated, 0 without any; None where they differ: a page has one for all."""
+    lengths = {length for *_, length in settings.strain_gauges} or {0.0}
+    return lengths.pop() if len(lengths) == 1 else None
+
+
+def view_entry(default: Any, widget: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
+    """Declare an entry of the view: its default, and widget, text and options of its control, which limit the value."""
+    return field(default=default, metadata={"control": (widget, text, options)})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewState:
+    """Frame, field, colours, part of the image and probes in view.
+
+    Attributes
+    ----------
+    frame
+        Index of the frame in the result.
+    field
+        Name of the field.
+    over
+        Image under the field: the ``"reference"``, or the ``"deformed"`` one of the frame.
+    range
+        Source of the colour range: this ``"frame"``, the whole ``"test"``, or `low` and `high` (``"hand"``).
+    low, high
+        Ends of the colours by hand.
+    symmetric
+        Whether the colours of a signed field are as far below 0 as above.
+    directions
+        Whether principal directions are drawn.
+    opacity
+        Opacity of the field, from 0 to 1.
+    second, third, fourth
+        Names of fields beside it; ``"uncertainty"``: that of the first; empty: none.
+    palette, levels
+        Name of the colours, empty: those that suit the field; and their number.
+    hatched
+        Whether what lies within two standard uncertainties of 0 is hatched.
+    vectors, longer
+        Whether displacements are drawn as arrows, and so many times their length; 0: as long as there is room.
+    contours, extremes, blank
+        Whether lines between the colours, the places of the smallest and the largest value, and the nodes without data
+        are drawn.
+    gauge, measure
+        Length of the virtual strain gauges in px, 0: the shortest; and the strain measure.
+    since, rigid, rate_window
+        As `Maps` has them; -1: the test's reference, 0: the usual window.
+    curve, along
+        Quantity of the probes whose curve is shown, empty: the first; and the one along x, empty: the time.
+    line
+        Line along which the field is shown in place of the curves; empty: none.
+    channels, clock, offset, trigger, align, align_to, area, force
+        CSV file beside the test, and what ``[channels]`` states of it; `clock`: which of offset (s), trigger and
+        correlation of the channel `align` with the curve `align_to` counts. The area (mm²) 0: not stated.
+    beside
+        Channel that is drawn beside the curves; empty: none.
+    distance, distance_std
+        Distance of the two scale marks in mm and its standard uncertainty; 0: not stated.
+    camera
+        File with lens and plane in place of that; empty: none.
+    theme
+        ``"light"``, ``"dark"``, or empty: as the browser likes it.
+    window
+        Edges (left, top, right, bottom) of the image in view, px; empty: all of the mesh.
+    marks
+        Places of the probes.
+    """
+
+    frame: int = 0
+    field: str = view_entry("u", bk.Select, "Field")
+    over: str = view_entry(BACKGROUNDS[0], options=BACKGROUNDS)
+    range: str = view_entry("frame", bk.Select, "Colours from", options=_RANGES)
+    low: float = view_entry(-1.0, bk.NumericInput, "lowest", mode="float")
+    high: float = view_entry(1.0, bk.NumericInput, "highest", mode="float")
+    symmetric: bool = view_entry(False, bk.Checkbox, "symmetric about 0")
+    directions: bool = view_entry(False, bk.Checkbox, "principal directions")
+    opacity: float = view_entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
+    second: str = view_entry("", bk.Select, "Second field")
+    third: str = view_entry("", bk.Select, "Third field")
+    fourth: str = view_entry("", bk.Select, "Fourth field")
+    palette: str = view_entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
+    levels: int = view_entry(256, bk.Spinner, "Number of colours", low=2, high=256)
+    hatched: bool = view_entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
+    vectors: bool = view_entry(False, bk.Checkbox, "displacement as arrows")
+    longer: float = view_entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
+    contours: bool = view_entry(False, bk.Checkbox, "contour lines")
+    extremes: bool = view_entry(False, bk.Checkbox, "smallest and largest value")
+    blank: bool = view_entry(False, bk.Checkbox, "nodes without data")
+    gauge: float = view_entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
+    measure: str = view_entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
+    since: int = view_entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
+    rigid: bool = view_entry(False, bk.Checkbox, "rigid motion removed")
+    rate_window: int = view_entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
+    curve: str = view_entry("")
+    along: str = view_entry("", bk.Select, "Along x")
+    channels: str = view_entry("", bk.TextInput, "CSV file beside the test")
+    clock: str = view_entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
+    offset: float = view_entry(0.0, bk.NumericInput, "Offset, s", mode="float")
+    trigger: str = view_entry("", bk.Select, "Trigger channel")
+    align: str = view_entry("", bk.Select, "Channel")
+    align_to: str = view_entry("", bk.Select, "alike to")
+    area: float = view_entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
+    force: str = view_entry("", bk.Select, "Force")
+    beside: str = view_entry("", bk.Select, "Beside the curves")
+    distance: float = view_entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
+    distance_std: float = view_entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
+    camera: str = view_entry("", bk.TextInput, "or camera")
+    line: str = view_entry("")
+    theme: str = view_entry("", options=("light", "dark"))
+    window: tuple[float, ...] = ()
+    marks: tuple[Mark, ...] = ()
+
+    @classmethod
+    def controls(cls) -> dict[str, tuple[type[bk.Widget], str, dict[str, Any]]]:
+        """Return kind, text and options of the controls, by the entries that they set."""
+        controls = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
+        return {name: control for name, control in controls.items() if control[0] is not None}
+
+    @classmethod
+    def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
+        """Read the view from an address; parts that are invalid are left at their defaults.
+
+        Parameters
+        ----------
+        query
+            Values of the address by their keys; the last one of each counts.
+        frames
+            Number of frames of the result.
+        names
+            Names of its fields.
+        frame
+            Index of the frame where the address states none.
+
+        Returns
+        -------
+        ViewState
+            A valid view of the result.
+        """
+        texts = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
+        parsed = {
+            entry.name: _parse_entry(entry, texts[entry.name], names) for entry in fields(cls) if entry.name in texts
+        }
+        valid: dict[str, Any] = {name: value for name, value in parsed.items() if value is not None}
+        view = cls(**{"frame": frame, **valid})
+        view, defaults = (
+            replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)),
+            cls(),
+        )
+        return view if view.low < view.high else replace(view, low=defaults.low, high=defaults.high, range="frame")
+
+    def with_probes(self, settings: ProbeSettings, min_gauge: float) -> Self:
+        """Return the view with the probes stated, where its address has none.
+
+        Strain gauges are among them if all have one length, `min_gauge` (px) or more, and the address states no other.
+        """
+        gauge, marks = common_gauge(settings), marks_of_probes(settings)
+        if not gauge or gauge < min_gauge or self.gauge not in (0, gauge):
+            gauge, marks = self.gauge, tuple(mark for mark in marks if mark.kind != "strain_gauge")
+        return self if self.marks or not marks else replace(self, marks=marks, gauge=gauge)
+
+    def with_channels(self, settings: ChannelSettings) -> Self:
+        """Return the view with what ``[channels]`` states, unless its address names a file."""
+        if self.channels or settings.file is None:
+            return self
+        align, align_to = settings.align or ("", "")
+        clock = CLOCKS[1] if settings.trigger else CLOCKS[2] if settings.align else CLOCKS[0]
+        keys: dict[str, Any] = {"clock": clock, "offset": settings.offset, "area": settings.area or 0.0}
+        keys |= {"trigger": settings.trigger or "", "align": align, "align_to": align_to, "force": settings.force or ""}
+        return replace(self, channels=str(settings.file), **keys)
+
+    def channel_settings(self, base: Path) -> ChannelSettings:
+        """Return ``[channels]`` as it is in view, its file relative to a folder; what is not chosen yet is left out."""
+        if not self.channels:
+            return ChannelSettings()
+        clocks: dict[str, Any] = {
+            "offset": {"offset": self.offset},
+            "trigger": {"trigger": self.trigger or None},
+            "correlation": {"align": (self.align, self.align_to) if self.align and self.align_to else None},
+        }
+        return ChannelSettings(
+            file=base / self.channels, area=max(self.area, 0) or None, force=self.force or None, **clocks[self.clock]
+        )
+
+    def scale_settings(self, base: Path, stored: ScaleSettings) -> ScaleSettings | None:
+        """Return ``[scale]`` as it is in view, its file relative to a folder, with the frame rate kept; None: none.
+
+        Raises
+        ------
+        InputError
+            Two scale marks and their distance make no scale.
+        """
+        if self.camera:
+            return ScaleSettings(camera=base / self.camera, frame_rate=stored.frame_rate)
+        points = [(mark.x, mark.y) for mark in self.marks if mark.kind == SCALE]
+        if len(points) < 2 or not self.distance:
+            return None
+        units = Units.from_points(points, self.distance, length_std=self.distance_std)
+        std = units.mm_per_pixel_std
+        return ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=std, frame_rate=stored.frame_rate)
+
+    def query(self) -> str:
+        """Return the address without the frame: all that differs from the defaults."""
+        defaults = type(self)()
+        entries = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
+        texts = {name: _format_entry(value) for name, value in entries.items() if value != getattr(defaults, name)}
+        return urlencode(texts, safe=":,;")
+
+
+def _format_entry(value: object) -> str:
+    if isinstance(value, tuple):
+        if value and isinstance(value[0], Mark):
+            return ";".join(f"{mark.kind}:{mark.x:.6g},{mark.y:.6g}{mark.name and f',{mark.name}'}" for mark in value)
+        return ",".join(f"{number:.6g}" for number in value)
+    if isinstance(value, float):  # the offset of a clock may have more digits
+        return text if float(text := f"{value:.6g}") == value else repr(value)
+    return str(int(value) if isinstance(value, bool) else value)
+
+
+def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
+    """Return the value that a text states for an entry; None where it is invalid."""
+    _, _, options = entry.metadata.get("control", (None, "", {}))
+    try:
+        if isinstance(entry.default, bool):
+            return bool(int(text))
+        if isinstance(entry.default, (int, float)):
+            low, high = options.get("low", options.get("start")), options.get("high", options.get("end"))
+            number = max(_number(text), -math.inf if low is None else low)
+            return type(entry.default)(min(number, math.inf if high is None else high))
+        if entry.name == "window":
+            x_min, y_min, x_max, y_max = map(_number, text.split(","))
+            return (x_min, y_min, x_max, y_max) if x_min < x_max and y_min < y_max else None
+        if entry.name == "marks":
+            tokens = [re.split("[:,]", mark) for mark in text.split(";")[: VIEWER.address_marks]]
+            marks = tuple(Mark(kind, _number(x), _number(y), *name) for kind, x, y, *name in tokens)
+            mark_names = [mark.name for mark in marks if mark.name]
+            are_valid = all(mark.kind in MARKS for mark in marks) and all(map(PROBE_NAME.fullmatch, mark_names))
+            return marks if are_valid and len(set(mark_names)) == len(mark_names) else None
+    except (TypeError, ValueError):
+        return None
+    if entry.name in ("field", *EXTRA_FIELDS):
+        return text if text in names or (text == UNCERTAINTY and entry.name in EXTRA_FIELDS) else None
+    if "options" in options:
+        return (
+            text
+            if text in [option if isinstance(option, str) else option[0] for option in options["options"]]
+            else None
+        )
+    return text[: VIEWER.address_letters]
+
+
+def _number(text: str) -> float:
+    if not abs(number := float(text)) <= VIEWER.address_number:
+        raise ValueError(text)
+    return number

@@ -1,0 +1,244 @@
+"""What all pages have: controls, the scripts that run in the browser, errors that are shown, work beside the page."""
+
+from __future__ import annotations
+
+import html
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from importlib.resources import files
+from typing import Any, TypeVar
+
+import bokeh.models as bk
+from bokeh.core.properties import Int, String
+from bokeh.document import Document
+from bokeh.layouts import column, row
+from bokeh.model import DataModel
+
+from rgbmidic.errors import RgbmidicError
+from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.url_state import ViewState
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+LIVE_REGION = {"aria-live": "polite"}
+"""Attributes of a text whose changes screen readers read out."""
+
+
+def page_file(name: str) -> str:
+    """Return the text of a file of the page that lies beside this module."""
+    return files("rgbmidic.tools.view").joinpath(name).read_text(encoding="utf-8")
+
+
+def script(name: str, **parts: Any) -> bk.CustomJS:
+    """Call a function of page.js in the browser with parts of the page, and plain values, by their names."""
+    return bk.CustomJS(args=parts, code=f"rgbmidic.{name}({{{', '.join(parts)}}})")
+
+
+def aria_group(label: str) -> dict[str, str]:
+    """Return HTML attributes of a group of controls with the label that screen readers read out."""
+    return {"role": "group", "aria-label": label}
+
+
+def warning(text: str) -> str:
+    """Return a remark as HTML that stands out."""
+    return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
+
+
+def run_guarded(action: Callable[[], object], report: Callable[[str], None]) -> None:
+    """Call `action`; an error is reported in one line by `report`, and the page goes on."""
+    try:
+        action()
+    except (RgbmidicError, OSError) as error:
+        report(str(error))
+    except Exception as error:  # the last resort of a page
+        logger.exception("the page failed")
+        report(f"{type(error).__name__}: {error}")
+
+
+def is_watched(document: Document) -> bool:
+    """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
+    session = document.session_context.session if document.session_context else None
+    return session is None or session.connection_count > 0
+
+
+def call_periodically(
+    milliseconds: int, document: Document, action: Callable[[], None], report: Callable[[str], None]
+) -> None:
+    """Call `action`, as `run_guarded`, again and again while a browser shows the page."""
+    document.add_periodic_callback(lambda: run_guarded(action, report) if is_watched(document) else None, milliseconds)
+
+
+class Background:
+    """Work for a page in another thread, one task after the other, of which only the last that was asked for counts.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    """
+
+    def __init__(self, document: Document) -> None:
+        self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
+        document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
+
+    def cancel(self) -> None:
+        """Forget the task that was asked for."""
+        self._task.cancel()
+        self._task = Future()
+
+    def submit(self, work: Callable[[], T], receive: Callable[[Callable[[], T]], None]) -> None:
+        """Start a task; `receive` gets a function that returns its result or raises its error, in the page's thread."""
+        self.cancel()
+        task = self._task = self._thread.submit(work)
+        deliver = lambda: receive(task.result) if task is self._task else None  # noqa: E731
+        task.add_done_callback(lambda _: self._document.add_next_tick_callback(deliver))
+
+
+class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml
+    """State that browser and server share: frame asked for, frame shown, rest of the address, files to keep."""
+
+    requested_frame = Int(0)
+    displayed_frame = Int(0)
+    query = String("")
+    csv = String("")
+    png = String("")
+
+
+class Controls:
+    """Controls that every page has: texts, theme, and the player of the frames.
+
+    Parameters
+    ----------
+    last
+        Index of the last frame.
+    frame
+        Index of the frame in view at first.
+    dark
+        Whether the page is dark.
+
+    Attributes
+    ----------
+    small, wide
+        Options of a control of fixed width, and of one as wide as its column.
+    player
+        The row of play button, step and slider.
+    """
+
+    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
+        styles = ("widgets.css", "dark.css") if dark else ("widgets.css",)
+        self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=page_file(name)) for name in styles]}
+        self.wide = wide = {**self.small, "sizing_mode": "stretch_width"}
+        other_theme, max_frame = "light" if dark else "dark", max(last_frame, 1)
+        self.head, self.message = bk.Div(**wide), bk.Div(name="message", **wide)
+        self.description = bk.Div(name="description", html_attributes=LIVE_REGION, **wide)
+        self.theme = bk.Button(label=f"{other_theme.capitalize()} page", **wide)
+        self.theme.js_on_click(script("turn", theme=other_theme))
+        self.frame = bk.Slider(
+            title="Frame", name="frame", start=0, end=max_frame, step=1, value=frame, disabled=last_frame < 1, **wide
+        )
+        self.play = bk.Toggle(label="▶ Play", name="play", width=90, **self.small)
+        label = aria_group("frames that Play and the arrow keys go on by")
+        self.step = bk.Spinner(
+            name="step", low=1, high=max_frame, value=1, width=70, html_attributes=label, **self.small
+        )
+        self.player = row(self.play, self.step, self.frame, sizing_mode="stretch_width")
+
+    def group(self, name: str, label: str, labels: Iterable[str], active: int | None = 0) -> Any:
+        """Make buttons of which one is pressed, with a label for screen readers."""
+        look = {"html_attributes": aria_group(label), **self.wide}
+        return bk.RadioButtonGroup(labels=list(labels), active=active, name=name, **look)
+
+    def request_frames(self, state: SharedState) -> None:
+        """Let the slider ask for frames, and play them."""
+        request = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=VIEWER.play_ms)
+        self.frame.js_on_change("value", request)
+        self.play.js_on_change("active", request)
+        state.js_on_change("displayed_frame", request)
+
+
+SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
+    "Field": ("field", "second", "third", "fourth", "over", "opacity", "print"),
+    "Colours": ("range", ("low", "high"), "lock", "symmetric", "palette", "levels", "hatched"),
+    "Layers": ("directions", "contours", "extremes", "blank", "vectors", "longer"),
+    "Derived": ("gauge", "measure", "since", "rigid", "rate_window"),
+    "Probes": ("mode", ("curve", "along"), ("probe", "name"), ("undo", "redo", "clear"), ("csv", "png"), "message"),
+    "Channels": ("channels", ("beside", "clock"), "trigger", ("align", "align_to"), "offset", "drag", ("force", "area"),
+                 "channel_status"),
+    "File": ("scale", ("distance", "distance_std", "camera"), "scale_label", "file", "sections_to_write",
+             ("write", "load_probes"), "save_status"),
+}  # fmt: skip
+"""Controls of a result by the section under which they stand, some in one row: one section is shown at a time, and fits
+a screen of 720 rows."""
+WRITABLE_SECTIONS = ("probes", "channels", "scale")
+"""Sections of a TEST.toml that the page can write."""
+MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
+
+
+class ResultControls(Controls):
+    """Controls of the page of a result, with nothing chosen yet; parameters as `Controls`.
+
+    Attributes
+    ----------
+    entry_controls : dict
+        The control of each entry of the view.
+    """
+
+    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
+        super().__init__(last_frame, frame, dark=dark)
+        wide, self.entry_controls = self.wide, dict[str, Any]()
+        for entry, (widget, text, options) in ViewState.controls().items():
+            name = {"field": "quantity"}.get(entry, entry)
+            text_key, look = ("label", self.small) if widget is bk.Checkbox else ("title", wide)
+            self.entry_controls[entry] = widget(name=name, **{text_key: text}, **options, **look)
+        self.over = self.group("over", "image", ["over the reference", "over the frame"], active=None)
+        self.section = self.group("section", "controls shown", SECTIONS)
+        self.mode = self.group("mode", "what a click sets", MODES)
+        self.scale = self.group("scale", "points of the scale", ["Move", "Two points of a distance"], active=None)
+        look = {"html_attributes": aria_group("sections that are written"), **wide}
+        self.sections_to_write = bk.CheckboxButtonGroup(
+            labels=list(WRITABLE_SECTIONS), active=[0], name="sections_to_write", **look
+        )
+        self.curve, self.probe = (bk.Select(title=text, name=text.lower(), **wide) for text in ("Curve", "Probe"))
+        self.name = bk.TextInput(title="its name", name="name", **wide)
+        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", value="TEST.toml", **wide)
+        self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
+        self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
+        folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
+        look = {"styles": folded, "html_attributes": LIVE_REGION, **self.small}
+        self.movie_status = bk.Div(name="movie_status", width=300, visible=False, **look)
+        self.player = row(self.play, self.step, self.frame, self.movie, self.movie_status, sizing_mode="stretch_width")
+        labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
+        self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.load_probes = (
+            bk.Button(label=name, name=name.lower(), **wide) for name in labels
+        )
+        self.print = bk.Button(label="Save PNG for print", name="print", **wide)
+        texts = ("pointer_label", "channel_status", "save_status", "scale_label")
+        self.pointer_label, self.channel_status, self.save_status, self.scale_label = (
+            bk.Div(name=name, **wide) for name in texts
+        )
+
+    @property
+    def side(self) -> Any:
+        """The column of all controls, of which one section is shown."""
+        flat, models = {"sizing_mode": "stretch_width"}, {**vars(self), **self.entry_controls}
+        section_columns: list[Any] = []
+        for names in SECTIONS.values():
+            section_models = [
+                models[name] if isinstance(name, str) else row(*map(models.get, name), **flat) for name in names
+            ]
+            section_columns.append(column(*section_models, visible=not section_columns, **flat))
+        self.section.js_on_change("active", script("turnTo", group=self.section, sections=section_columns))
+        return column(self.description, self.section, *section_columns, self.theme, **flat)
+
+    def wire(self, state: SharedState, tools: Sequence[Any], frame_mark: bk.Span) -> None:
+        """Let the browser itself act; `frame_mark` marks the frame that is shown."""
+        self.request_frames(state)
+        for name in ("displayed_frame", "query"):
+            state.js_on_change(name, script("showFrame", state=state, now=frame_mark))
+        state.js_on_change("csv", script("keepCsv", state=state))
+        state.js_on_change("png", script("keepPng", state=state))
+        groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
+        for group, group_tools, other_group in groups:
+            group.js_on_change("active", script("choose", group=group, tools=list(group_tools), other=other_group))
