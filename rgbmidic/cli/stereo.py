@@ -41,7 +41,7 @@ def stereo(
     ] = "plane",
     gauge: Annotated[float | None, Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")] = None,
     measure: command.Measure = None,
-    pair: Annotated[str, Option(help="Pair frames by their times (auto) or by number.")] = "auto",
+    pairing: Annotated[str, Option(help="Pair frames by their times (auto) or by number.")] = "auto",
     overwrite: Overwrite = False,
     resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
     workers: Workers = 0,
@@ -51,15 +51,15 @@ def stereo(
     """Measure shape, motion and surface strain in three dimensions with two cameras."""
     from rgbmidic.tools.stereo import StereoSettings, measure_stereo
 
-    if pair not in ("auto", "number"):
-        raise InputError(f"--pair is auto or number, not {pair!r}")
+    if pairing not in ("auto", "number"):
+        raise InputError(f"--pairing is auto or number, not {pairing!r}")
     if overwrite and resume:
         raise InputError("--overwrite begins anew, --resume goes on: state one of them")
     settings = StereoSettings(
         axes=_read_axes(axes),
         gauge=gauge,
         measure=measure or "green-lagrange",
-        pairing="number" if pair == "number" else "auto",
+        pairing="number" if pairing == "number" else "auto",
     )
     try:
         with progress_bar("measuring") as progress:

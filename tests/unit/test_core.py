@@ -15,7 +15,7 @@ from rgbmidic.extensions import LIGHT_WEIGHTS, MESH_SOURCES, PROBES, load_extens
 CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "results", "pipeline", "settings")
 TOOLS = {
     *("typer", "rich", "bokeh", "matplotlib"),
-    *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view", "tools.finite_elements", "tools.stereo")),
+    *(f"rgbmidic.tools.{room}" for room in ("scene", "lab", "report", "view", "finite_elements", "stereo")),
 }
 SLOW = {"scipy.signal", "scipy.stats", "scipy.optimize", "numba", "llvmlite"}
 """Packages that would double the time until a command begins; a kernel imports numba with its first call."""

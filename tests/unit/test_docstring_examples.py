@@ -20,8 +20,8 @@ PACKAGES = [
             "fields",
             "results",
             "pipeline",
-            "report",
-            "view",
+            "tools.report",
+            "tools.view",
             "tools.finite_elements",
         )
     ),

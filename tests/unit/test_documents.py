@@ -134,7 +134,7 @@ def test_keys_options_and_files_that_a_page_mentions_exist(page):
     """Names of the code are looked up by tests/examples/test_pages.py."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     keys = {f"{name}.{entry.name}" for name, kind in section_types().items() for entry in fields(kind)} | FORMER_KEYS
-    sources = [*ROOT.glob("rgbmidic/c*.py"), *ROOT.glob("*/__main__.py"), ROOT / "examples/paper/run.py"]
+    sources = [*ROOT.glob("rgbmidic/cli/*.py"), *ROOT.glob("*/__main__.py"), ROOT / "examples/paper/run.py"]
     sources += [ROOT / "tests/conftest.py", *DOCS.glob("reference/*commands.md")]
     options = set(re.findall(r"--[a-z][a-z-]*", "\n".join(file.read_text(encoding="utf-8") for file in sources)))
     for quoted in re.findall(r"`([^`\n]+)`", text):

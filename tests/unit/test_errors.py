@@ -56,9 +56,7 @@ def test_a_text_is_shown_once() -> None:
 def messages() -> Iterator[str]:
     """Yield the texts of the library, without its docstrings and its commands; ``{}`` for what is filled in."""
     package = Path(rgbmidic.__file__).parent
-    for path in (
-        path for path in package.rglob("*.py") if not path.name.startswith(("cli", "command", "result_source"))
-    ):
+    for path in (path for path in package.rglob("*.py") if "cli" not in (path.parent.name, path.stem)):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         nodes = list(ast.walk(tree))
         within = {part for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node)} | {

@@ -282,10 +282,11 @@ def _check_times(tests: tuple[_Test, _Test], pairing: str) -> None:
         return
     delays = np.abs(times[1] - times[0])
     interval = float(np.median(np.diff(times[0]))) if len(delays) > 1 else np.inf
-    if (worst := int(np.argmax(delays)), delays.max() > _LARGEST_DELAY * interval)[1]:
+    if delays.max() > _LARGEST_DELAY * interval:
+        worst = int(np.argmax(delays))
         first = int(np.argmax(delays > _LARGEST_DELAY * interval))
         raise InputError(
             f"frames {first} of {left.name} and {right.name} were taken {delays[first]:.3g} s apart (frames {worst}: "
             f"{delays[worst]:.3g} s), with {interval:.3g} s between frames: choose the same ones with frames.first and "
-            'last, or pair them by number (--pair number, pairing = "number") if the clocks differ'
+            "last, or pair them by number (`pairing`) if the clocks differ"
         )
