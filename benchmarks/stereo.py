@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -134,7 +133,6 @@ def stereo(quick: bool) -> Iterator[Row]:
     """Rms errors of two cameras 22° apart before a sphere turning under three lamps (448 px, .055 mm per px, elements
     of 25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface strain
     over 77 px, of which there is none; with all three lamps, and with the red one alone in the same frames."""
-    logging.getLogger("rgbmidic").setLevel(logging.ERROR)
     for paint, gloss in {"shiny": 1.5, "mat": 0.0}.items():
         if quick and paint == "mat":
             continue

@@ -81,7 +81,7 @@ def test_the_unit_of_the_weights_changes_nothing(seed, factor):
     weights = np.random.default_rng(seed).uniform(0.2, 1, SHAPE)
     once, scaled = (measured(*pair, weights=weights * c) for c in (1.0, factor))
     np.testing.assert_allclose(scaled.displacement, once.displacement, atol=SAME)
-    np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=2e-2)
+    np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=1e-2)
 
 
 @given(seed=seeds, gain=st.floats(0.01, 50), offset=st.floats(0, 300))
@@ -90,7 +90,8 @@ def test_the_unit_of_the_grey_levels_changes_nothing(seed, gain, offset):
     pair = strained(seed)
     once, scaled = measured(*pair), measured(*(gain * (image + offset) for image in pair))  # float32 needs contrast
     np.testing.assert_allclose(scaled.displacement, once.displacement, atol=SAME)
-    np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=2e-2)
+    # the gain is that of local means: what is added to all grey levels makes them more certain, by 3 % at a corner
+    np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=4e-2)
 
 
 @pytest.mark.parametrize("copies", [2, 3, 5])

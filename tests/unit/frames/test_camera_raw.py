@@ -257,7 +257,7 @@ def test_headerless_file_is_not_taken_for_a_camera_raw_by_its_length(tmp_path: P
     for name in ("frame.raw", "frame.nef"):
         (tmp_path / name).write_bytes(content)
         assert rawpy.imread(str(tmp_path / name)).raw_image.shape == (768, 1024)
-        with pytest.raises(FrameError, match="`shape` and `dtype`"):
+        with pytest.raises(FrameError, match=r"shape\W+ and \W+dtype|shape and dtype"):
             read_frame(tmp_path / name)
 
 

@@ -35,7 +35,7 @@ print(len(before), *sorted({name for name, _ in kernels() - before}))
 
 def test_a_measurement_compiles_nothing_that_the_small_measurements_have_not(tmp_path):
     """But for the renderer, which makes this test's frames."""
-    tests = str(Path(__file__).parents[2])
+    tests = str(Path(__file__).parents[3])
     script = f"import sys; sys.path.insert(0, {tests!r})\n{_REST}"
     done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True)
     number, *more = done.stdout.split()

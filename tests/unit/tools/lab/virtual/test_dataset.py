@@ -14,7 +14,7 @@ from rgbmidic.tools.lab.virtual.dataset import write_dataset, write_stereo_datas
 from rgbmidic.tools.scene.scene import read_scene
 from rgbmidic.tools.stereo import CameraPair
 
-EXAMPLES = Path(__file__).parents[4] / "examples" / "scenes"
+EXAMPLES = Path(__file__).parents[5] / "examples" / "scenes"
 
 SMALL = """
 [camera]
