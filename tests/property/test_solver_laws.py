@@ -89,8 +89,8 @@ def test_the_unit_of_the_weights_changes_nothing(seed, factor):
 def test_the_unit_of_the_grey_levels_changes_nothing(seed, gain, offset):
     pair = strained(seed)
     once, scaled = measured(*pair), measured(*(gain * (image + offset) for image in pair))  # float32 needs contrast
-    np.testing.assert_allclose(scaled.displacement, once.displacement, atol=SAME)
     # the gain is that of local means: what is added to all grey levels makes them more certain, by 3 % at a corner
+    np.testing.assert_allclose(scaled.displacement, once.displacement, atol=5e-3)
     np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=4e-2)
 
 
