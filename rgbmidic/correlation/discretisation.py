@@ -27,12 +27,12 @@ from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
-from rgbmidic.correlation.recovery import Recovery, at_free_boundary, slope_operators
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
+from rgbmidic.mesh.recovery import Recovery, at_free_boundary, slope_operators
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

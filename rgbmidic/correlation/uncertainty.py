@@ -15,9 +15,9 @@ import scipy.sparse as sp
 from rgbmidic.correlation.assembly import RigidMotions, block_side
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.recovery import Functional, Recovery, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
+from rgbmidic.mesh.recovery import Functional, Recovery, functional_std
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
