@@ -14,24 +14,26 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.weights import best_mean, robust_weights
-from rgbmidic.correlation import PrecisionMethod
-from rgbmidic.correlation.images import WINDOW, SlidingWindow, unmasked
-from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.correlation.uncertainty import design_effect
+from rgbmidic.arguments import unmasked
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.extensions import LIGHT_WEIGHTS, load_extension
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.mesh.window import WINDOW, SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
+from rgbmidic.weights.precision import Precision
 from rgbmidic.weights.threshold import ThresholdWeights
+
+if TYPE_CHECKING:
+    from rgbmidic.correlation import PrecisionMethod, Residual
 
 
 class LightWeights(Protocol):
@@ -463,7 +465,7 @@ class Statistics(ValidPixels):
             rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
             differing_fraction = float((rim_map > variance_map)[rim > 0].mean())
             np.copyto(variance_map, rim_map, where=rim > 0)
-        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
+        displacing = residual.design_effect(mean, has_weight / variance_map)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
         rim_differs = differing_fraction > self.min_rim_fraction
         return Precision(factor=factor, loss_curvature=bend, rim_differs=rim_differs)
