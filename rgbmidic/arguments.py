@@ -11,13 +11,23 @@ from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
 from rgbmidic.settings.conversion import convert_fields, convert_value, type_hints
+from rgbmidic.typing import AnyArray
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _SIMPLE = (float, int, bool, str, Path)
+
+
+def unmasked(array: npt.ArrayLike) -> AnyArray:
+    """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        values: Any = array if array.dtype.kind in "fc" else array.astype(np.float64)
+        return np.asarray(np.ma.filled(values, np.nan))
+    return np.asarray(array)
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.typing import BoolArray, FloatArray
 
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 210, 170), (200, 240)), 20)

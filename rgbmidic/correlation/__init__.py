@@ -5,11 +5,12 @@ from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.correlation.one_sided_fit import unresolved_strain, with_one_sided_error
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import TrackingState, find_initial_guess, track
 from rgbmidic.renamed import refuse_old_names
+from rgbmidic.weights.precision import Precision
 
 __all__ = [
     "Deformed",

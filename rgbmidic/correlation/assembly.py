@@ -23,9 +23,10 @@ from rgbmidic._kernels.correlation import element_block_products, element_hessia
 from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.elimination import Elimination
-from rgbmidic.correlation.images import apply_prefilter, window_sums
+from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
+from rgbmidic.mesh.window import window_sums
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 

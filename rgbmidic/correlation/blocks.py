@@ -10,16 +10,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.owned_pixels import score_sums
 from rgbmidic.correlation.assembly import block_side
-from rgbmidic.correlation.images import window_sums
 from rgbmidic.correlation.reference import Reference
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh.window import window_sums
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+
+if TYPE_CHECKING:
+    from rgbmidic.correlation.residual import Residual
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

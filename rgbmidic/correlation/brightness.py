@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 
 from rgbmidic.correlation.constants import SolverConstants
-from rgbmidic.correlation.images import SlidingWindow, centred_products, window_sums
+from rgbmidic.correlation.images import centred_products
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
+from rgbmidic.mesh.window import SlidingWindow, window_sums
 from rgbmidic.typing import FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]

@@ -166,10 +166,6 @@ class SolverConstants:
         the solution: it changes over some 50 px, and the mean
         of the lights that agree is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger
         on raised droplets.
-    bias_correlation_range
-        Range r (px) of the correlation ``exp(-d^2 / (4 r^2))`` of what the lights' bias leaves at two places a distance
-        d apart: a bias changes over some 50 px, and is seen in a window of `bias_range`. 32 to 36 px fit errors on
-        raised droplets of two renderers under three lights, 47 to 53 px under two lamps in succession (measured).
     bias_across
         Fraction of the variance across a direction that is stated in it where no lights agree: an estimate from two or
         three lights has few degrees of freedom. Without, places that were stated largest on raised droplets erred by .3
@@ -239,7 +235,6 @@ class SolverConstants:
     information_smoothing: float = 0.6
     prior_blocks: float = 0.1
     bias_range: float = 24.0
-    bias_correlation_range: float = 34.0
     bias_across: float = 0.25
     local_bias_range: float = 8.0
     local_bias_threshold: float = 8.0

@@ -27,12 +27,13 @@ from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
-from rgbmidic.correlation.recovery import Recovery, at_free_boundary, slope_operators
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
+from rgbmidic.correlation.uncertainty import robust_loss
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
+from rgbmidic.mesh.recovery import Recovery, at_free_boundary, slope_operators
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -217,7 +218,7 @@ def _precision_weights(
     if precision is None:
         return prior_weights, 1.0
     weights = prior_weights * precision.factor
-    return weights, precision.robust_loss(residual.reference, weights)[:, None]
+    return weights, robust_loss(precision, residual.reference, weights)[:, None]
 
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:

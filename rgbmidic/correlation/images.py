@@ -1,20 +1,16 @@
-"""Images prepared for correlation (holes, prefilter, spline, usable pixels), and means in a window around pixels."""
+"""Images prepared for correlation: holes, prefilter, spline, usable pixels."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.owned_pixels import product_sums
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
+from rgbmidic.arguments import unmasked
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
-from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
 PREFILTERS: dict[str, FloatArray] = {
@@ -24,14 +20,6 @@ PREFILTERS: dict[str, FloatArray] = {
     "gaussian": _GAUSSIAN / _GAUSSIAN.sum(),
 }
 """One-dimensional prefilters, applied along both axes; ``"gaussian"`` has a standard deviation of 1 px."""
-
-
-def unmasked(array: npt.ArrayLike) -> AnyArray:
-    """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
-    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
-        values: Any = array if array.dtype.kind in "fc" else array.astype(np.float64)
-        return np.asarray(np.ma.filled(values, np.nan))
-    return np.asarray(array)
 
 
 def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
@@ -121,55 +109,3 @@ def centred_products(moments: FloatArray) -> tuple[FloatArray, FloatArray, Float
         for deviation, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
     )
     return fg - f * g / total, beyond_f, beyond_g
-
-
-def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
-    """Sum a grid (h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grid there is nothing."""
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlidingWindow:
-    """Gaussian window for means of fields around the owned pixels, applied on a grid of blocks.
-
-    Attributes
-    ----------
-    sigma
-        Its standard deviation, px: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
-        narrow beside a reflection. Chosen; with half or twice of it in the weights lights under one differ by 3e-3 px
-        at most, beside a gap by 6e-3 px, their uncertainty by 8 % (benchmarks/constants.py).
-    step
-        Side of the blocks, px: half the standard deviation, to which it adds 1 %.
-    """
-
-    sigma: float = 8.0
-    step: int = 4
-
-    def ratios(self, pixels: PixelMap, fields: FloatImage) -> FloatImage:
-        """Sums of fields (n, P) around each block of the grid over that of the last one, (n - 1, h, w)."""
-        sums = pixels.block_sums(fields, self.step)
-        return self._means(sums[:-1], sums[-1:])
-
-    def covariance(self, pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-        """Average the products of each two fields (k, P) around each block of the grid, (k, k, h, w).
-
-        Their weight is the geometric mean of the fields' weights (k, P).
-        """
-        count = len(fields)
-        sums = np.empty((count * (count + 1), *pixels.grid(self.step)), dtype=np.float32)
-        product_sums(fields, weights, pixels.lines, pixels.run_offsets, pixels.offsets, self.step, sums)
-        means = np.empty((count, count, *sums.shape[1:]), dtype=np.float32)
-        first, second = np.tril_indices(count)
-        means[first, second] = means[second, first] = self._means(sums[::2], sums[1::2])
-        return means
-
-    def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
-        """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
-        sigma = self.sigma / self.step
-        means, weight_means = (np.stack([window_sums(grid, sigma) for grid in grids]) for grids in (totals, weights))
-        means /= np.maximum(weight_means, np.float32(1e-6), out=weight_means)
-        return np.asarray(means, dtype=np.float32)
-
-
-WINDOW = SlidingWindow()
-"""The window that is used by default."""

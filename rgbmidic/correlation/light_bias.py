@@ -19,7 +19,7 @@ from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.illumination.displacement import consensus_weights
+from rgbmidic.illumination.displacement import BIAS_CORRELATION_RANGE, consensus_weights
 from rgbmidic.typing import FloatArray, FloatImage
 
 
@@ -79,5 +79,5 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
-    reach = np.sqrt(2) * constants.bias_correlation_range
+    reach = np.sqrt(2) * BIAS_CORRELATION_RANGE
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

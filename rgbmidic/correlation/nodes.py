@@ -14,10 +14,11 @@ from rgbmidic._kernels.correlation import element_hessian
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.images import centred_products
 from rgbmidic.correlation.reference import torn_elements
-from rgbmidic.correlation.residual import Precision, Residual
+from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.weights.precision import Precision
 
 
 def classify_nodes(

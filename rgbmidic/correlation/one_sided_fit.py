@@ -16,9 +16,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.recovery import Recovery, angle_fraction, at_free_boundary
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery, angle_fraction, at_free_boundary
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 

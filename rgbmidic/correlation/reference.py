@@ -32,7 +32,6 @@ from rgbmidic.correlation.brightness import (
 )
 from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.images import (
-    SlidingWindow,
     filter_variance,
     spline_coefficients,
     spline_values,
@@ -44,6 +43,7 @@ from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.window import SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 

@@ -17,12 +17,14 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
+from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.weights.precision import Precision
 
 
 @state_new_names
@@ -138,6 +140,28 @@ class Residual:
         difference += self.difference
         return replace(self, difference=difference)
 
+    def design_effect(self, difference: FloatImage, weight: FloatImage) -> FloatImage:
+        """Return the variance of a residual's scores over what white noise of the same variance would give, (P,).
+
+        Parameters
+        ----------
+        difference : ndarray, shape (P,), float32
+            The residual, such as the mean of several lights'; its gradient is that of their common texture.
+        weight : ndarray, shape (P,), float32
+            Its inverse variance.
+
+        Returns
+        -------
+        ndarray, shape (P,), float32
+        """
+        reference = self.reference
+        block = reference.constants.min_block_side
+        table = BlockTable.of(reference, block, [(difference[None], weight[None], *reference.texture.texture[:, None])])
+        xx, _, yy = table.design_effect()[0]
+        # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
+        fraction = np.maximum(xx + yy, 0.01)
+        return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
+
     @property
     def smooth_fraction(self) -> float:
         """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
@@ -169,51 +193,6 @@ class Residual:
         pixel_positions = pixels.local_x, pixels.local_y, pixels.offsets
         subtract_quadratic(self.difference, *reference.gradient, deviation, *pixel_positions, out)
         return replace(self, difference=out)
-
-
-@state_new_names
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Precision:
-    """Precision of the lights, from their residuals.
-
-    Attributes
-    ----------
-    factor : ndarray, shape (k, P), float32
-        Factor on the weights that are given, in any unit.
-    loss_curvature : ndarray, shape (P,), float32
-        Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
-    rim_differs
-        The rim of the region shows another body somewhere, which has drawn the residual's displacement.
-
-    Examples
-    --------
-    >>> Precision(factor=np.ones((3, 100), np.float32), loss_curvature=np.ones(100, np.float32)).factor.shape
-    (3, 100)
-    """
-
-    factor: FloatImage
-    loss_curvature: FloatImage
-    rim_differs: bool = False
-
-    def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
-        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.
-
-        Parameters
-        ----------
-        reference
-            The reference that was solved on.
-        weights : ndarray, shape (k, P)
-            Weights of the solve.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-        """
-        total, bent = (
-            reference.mesh.to_nodes(sums) for sums in reference.sums(weights, self.loss_curvature).sum(axis=0).T
-        )
-        # 0.1, so that the quotient exists: up to twice of it nothing changes
-        return np.divide(total, np.maximum(bent, 0.1 * total), out=np.ones_like(total), where=total > 0)
 
 
 class PrecisionMethod(Protocol):

@@ -31,15 +31,16 @@ from rgbmidic.correlation.equations import (
 )
 from rgbmidic.correlation.light_bias import light_bias, with_consistent_gradient
 from rgbmidic.correlation.nodes import classify_nodes, matching_elements, misfit, one_sided_texture
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, refine_by_patch_matching
+from rgbmidic.correlation.residual import PrecisionMethod, Residual, refine_by_patch_matching
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.uncertainty import excess_over_chance, gradient_step, standard_uncertainty
 from rgbmidic.errors import InputError
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.weights.precision import Precision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

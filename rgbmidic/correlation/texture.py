@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from rgbmidic.correlation.images import WINDOW
 from rgbmidic.mesh import PixelMap
+from rgbmidic.mesh.window import WINDOW
 from rgbmidic.typing import FloatArray, FloatImage
 
 

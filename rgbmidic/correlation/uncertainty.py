@@ -15,31 +15,21 @@ import scipy.sparse as sp
 from rgbmidic.correlation.assembly import RigidMotions, block_side
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.recovery import Functional, Recovery, functional_std
 from rgbmidic.correlation.reference import Reference
-from rgbmidic.correlation.residual import Precision, Residual
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh.recovery import Functional, Recovery, functional_std
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.weights.precision import Precision
 
 
-def design_effect(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
-    """Return the variance of a residual's scores over what white noise of the same variance would give, (P,).
-
-    Parameters
-    ----------
-    reference
-        The gradient is that of the lights' common texture.
-    difference : ndarray, shape (P,), float32
-        The residual.
-    weight : ndarray, shape (P,), float32
-        Its inverse variance.
-    """
-    block = reference.constants.min_block_side
-    table = BlockTable.of(reference, block, [(difference[None], weight[None], *reference.texture.texture[:, None])])
-    xx, _, yy = table.design_effect()[0]
-    # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
-    fraction = np.maximum(xx + yy, 0.01)
-    return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
+def robust_loss(precision: Precision, reference: Reference, weights: FloatImage) -> FloatArray:
+    """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less."""
+    total, bent = (
+        reference.mesh.to_nodes(sums) for sums in reference.sums(weights, precision.loss_curvature).sum(axis=0).T
+    )
+    # 0.1, so that the quotient exists: up to twice of it nothing changes
+    return np.divide(total, np.maximum(bent, 0.1 * total), out=np.ones_like(total), where=total > 0)
 
 
 def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
@@ -226,7 +216,7 @@ def standard_uncertainty(
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in quantities])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
-        std = std * precision.robust_loss(reference, equations.weights)[:, None]
+        std = std * robust_loss(precision, reference, equations.weights)[:, None]
     return std
 
 

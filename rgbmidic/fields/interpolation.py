@@ -16,9 +16,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.arguments import checked
-from rgbmidic.correlation.recovery import slope_operators
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.recovery import slope_operators
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 

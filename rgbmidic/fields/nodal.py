@@ -23,10 +23,10 @@ import scipy.sparse as sp
 from numpy.polynomial import Chebyshev, Polynomial
 
 from rgbmidic.arguments import checked
-from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.displacement import BIAS_CORRELATION_RANGE
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -199,7 +199,7 @@ def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
 
 def _windows(nodes: FloatArray) -> sp.csr_matrix:
     """Gaussian windows around places a range of the lights' bias apart, at nodes (N, 2) in px of the image, (N, S)."""
-    at = nodes / USUAL.bias_correlation_range
+    at = nodes / BIAS_CORRELATION_RANGE
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     centre_index = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]

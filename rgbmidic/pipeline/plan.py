@@ -38,6 +38,7 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
+from rgbmidic.pipeline.automatic_threshold import automatic_weights
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
 from rgbmidic.pipeline.user_objects import check_user_objects
 from rgbmidic.results.quantities import MESH_DOCUMENT
@@ -227,13 +228,15 @@ class Plan:
             size = settings.mesh.side
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
-
-        def images_of(index: int) -> IlluminationImages:
-            return light_images(separate, series.read(index, window), window)
-
-        weights = weights or prepare_weights(
-            settings, images, region, shape=frame, frames=len(series), images_of=images_of
-        )
+        if weights is None and (settings.weights.method, settings.weights.threshold) == ("threshold", "auto"):
+            weights = automatic_weights(
+                settings,
+                images,
+                region,
+                frames=len(series),
+                images_of=lambda index: light_images(separate, series.read(index, window), window),
+            )
+        weights = weights or prepare_weights(settings, lights=images.names, shape=frame, frames=len(series))
         plan = cls(
             settings=settings,
             series=series,

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
+from rgbmidic.arguments import unmasked
 from rgbmidic.correlation import (
     Deformed,
     Reference,
@@ -28,7 +29,7 @@ from rgbmidic.correlation import (
     unresolved_strain,
     with_one_sided_error,
 )
-from rgbmidic.correlation.images import as_light_stack, unmasked
+from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import PrecisionMethod
 from rgbmidic.errors import ConfigurationError, FrameError, InputError

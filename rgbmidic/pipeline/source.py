@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 
-from rgbmidic.correlation.images import unmasked
+from rgbmidic.arguments import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame

@@ -8,6 +8,7 @@ from rgbmidic.weights.light_weights import (
     precision_method,
     prepare_weights,
 )
+from rgbmidic.weights.precision import Precision
 from rgbmidic.weights.threshold import (
     DisturbedZone,
     SetUpThreshold,
@@ -21,6 +22,7 @@ __all__ = [
     "DisturbedZone",
     "LightWeights",
     "MaskWeights",
+    "Precision",
     "SetUpThreshold",
     "Statistics",
     "as_weights",

@@ -14,25 +14,26 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.weights import best_mean, robust_weights
-from rgbmidic.correlation import PrecisionMethod
-from rgbmidic.correlation.images import WINDOW, SlidingWindow, unmasked
-from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.correlation.uncertainty import design_effect
+from rgbmidic.arguments import unmasked
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.extensions import LIGHT_WEIGHTS, load_extension
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.mesh import Region
+from rgbmidic.mesh.window import WINDOW, SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
-from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
+from rgbmidic.weights.precision import Precision
+from rgbmidic.weights.threshold import ThresholdWeights
+
+if TYPE_CHECKING:
+    from rgbmidic.correlation import PrecisionMethod, Residual
 
 
 class LightWeights(Protocol):
@@ -301,30 +302,20 @@ class PrepareWeights(Protocol):
 
 
 def prepare_weights(
-    settings: TestSettings,
-    reference: IlluminationImages,
-    region: Region,
-    *,
-    shape: tuple[int, int] | None = None,
-    frames: int,
-    images_of: Callable[[int], IlluminationImages],
+    settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int
 ) -> LightWeights:
-    """The method of weighting that the settings name.
+    """The method of weighting that the settings name; a `PrepareWeights`.
 
     Parameters
     ----------
     settings
         ``[weights]`` and what its method needs of the other sections.
-    reference
-        Images of the reference state.
-    region
-        What is measured.
+    lights
+        Names of the lights.
     shape
-        Rows and columns of the frames, of which the images may show a part; None: they show all.
+        Rows and columns of the frames.
     frames
         Number of frames of the test.
-    images_of
-        Gives the images of a frame; the automatic threshold looks at the first deformed one.
 
     Returns
     -------
@@ -334,38 +325,37 @@ def prepare_weights(
     ------
     ConfigurationError
         The scene of the method ``"geometry"`` is not readable or not that of the test; the masks of the method
-        ``"images"`` are not one per light or not of the size of the frames.
+        ``"images"`` are not one per light or not of the size of the frames; the threshold is ``"auto"``, which takes
+        the frames of a test (`rgbmidic.measure`).
     FrameError
         A mask cannot be read.
 
     Examples
     --------
     >>> from rgbmidic.settings import read_test
-    >>> values, region = np.full((3, 40, 60), 100.0), Region.from_rectangle((10, 10, 50, 30), shape=(40, 60))
-    >>> images = IlluminationImages(values=values, valid=values > 0, names=("red", "green", "blue"), full_scale=4095.0)
-    >>> type(prepare_weights(read_test("test.toml"), images, region, frames=2, images_of=lambda frame: images)).__name__
+    >>> weights = prepare_weights(read_test("test.toml"), lights=("red", "green", "blue"), shape=(40, 60), frames=2)
+    >>> type(weights).__name__
     'Statistics'
     """
     weights = settings.weights
-    frame = shape or reference.shape
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
         mask_values = np.asarray(masks.masks)
-        if mask_values.shape != (len(reference.names), *frame):
+        if mask_values.shape != (len(lights), *shape):
             raise ConfigurationError(
-                f"weights.images must name one mask per light ({', '.join(reference.names)}), of the frames' "
-                f"{frame[1]} x {frame[0]} px; given are {len(mask_values)} ({', '.join(masks.names)}) of "
+                f"weights.images must name one mask per light ({', '.join(lights)}), of the frames' "
+                f"{shape[1]} x {shape[0]} px; given are {len(mask_values)} ({', '.join(masks.names)}) of "
                 f"{_size(mask_values)} px"
             )
         return masks
     if weights.method == "threshold":
         if weights.threshold == "auto":
-            return automatic_weights(settings, reference, region, frames=frames, images_of=images_of)
+            raise ConfigurationError('weights.threshold = "auto" is found from the frames of a test; state a number')
         return ThresholdWeights(threshold=weights.threshold, blur=weights.blur)
     if weights.method in ("statistics", "none"):
         return Statistics() if weights.method == "statistics" else ValidPixels()
     prepare = load_extension(LIGHT_WEIGHTS, weights.method, "weights.method")
-    return prepare(settings, lights=reference.names, shape=frame, frames=frames)
+    return prepare(settings, lights=lights, shape=shape, frames=frames)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -475,7 +465,7 @@ class Statistics(ValidPixels):
             rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
             differing_fraction = float((rim_map > variance_map)[rim > 0].mean())
             np.copyto(variance_map, rim_map, where=rim > 0)
-        displacing = design_effect(residual.reference, mean, has_weight / variance_map)
+        displacing = residual.design_effect(mean, has_weight / variance_map)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
         rim_differs = differing_fraction > self.min_rim_fraction
         return Precision(factor=factor, loss_curvature=bend, rim_differs=rim_differs)

@@ -20,11 +20,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import rectification_of

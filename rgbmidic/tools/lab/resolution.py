@@ -19,9 +19,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.tools.lab import format_number, schema_document, write_findings

@@ -32,10 +32,10 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery, functional_std
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.tools.scene.camera import Floating
 from rgbmidic.tools.scene.scene import Scene

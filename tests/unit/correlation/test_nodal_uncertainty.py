@@ -14,8 +14,8 @@ from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh.recovery import Recovery, functional_std
 
 NOISE = 3.0
 """Standard deviation of the noise, 6 % of the texture's contrast."""

@@ -9,9 +9,9 @@ import pytest
 
 from rgbmidic.correlation import Solution, unresolved_strain, with_one_sided_error
 from rgbmidic.correlation.one_sided_fit import _CONSTANTS, _boundary_fits, one_sided_error
-from rgbmidic.correlation.recovery import Recovery, at_free_boundary
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery, at_free_boundary
 from rgbmidic.typing import FloatArray
 
 Y, X = np.mgrid[:200, :200]

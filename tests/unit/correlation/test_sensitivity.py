@@ -12,7 +12,7 @@ from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare
-from rgbmidic.correlation.recovery import Recovery, functional_std
+from rgbmidic.mesh.recovery import Recovery, functional_std
 from rgbmidic.settings import SolverSettings
 
 SHAPE, REGION = (150, 150), (10, 10, 139, 139)

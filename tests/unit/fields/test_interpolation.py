@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation
 
-from rgbmidic.correlation.recovery import at_free_boundary, quadratic_fit
 from rgbmidic.fields import MeshPoints, Nodal, ProfileLine, StrainGauges, at_pixels, make_probe
 from rgbmidic.fields.interpolation import PointSum
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.recovery import at_free_boundary, quadratic_fit
 from rgbmidic.typing import FloatArray
 
 ROUND = Tri3Mesh.from_region(Region.from_polygon([(10, 60), (60, 5), (115, 50), (70, 110)], (120, 120)), 11)

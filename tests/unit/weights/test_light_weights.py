@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import pickle
 from dataclasses import replace
 
@@ -10,15 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
 from rgbmidic.weights import MaskWeights, prepare_weights
-from rgbmidic.weights.threshold import FALLBACK
 
 SHAPE = (60, 80)
-REGION = Region.from_rectangle((0, 0, 79, 59), SHAPE)
 
 
 def images() -> IlluminationImages:
@@ -30,12 +26,12 @@ def images() -> IlluminationImages:
     return IlluminationImages(values=values, valid=valid, names=("a", "b"), full_scale=1000.0)
 
 
-def prepared(images_of=None, *, frames=2, **weights):
+def prepared(**weights):
     settings = TestSettings.from_mapping(
         {"frames": {"path": "x"}, "region": {"rectangle": [0, 0, 79, 59]}, "calibration": {"file": "c"}}
         | {"weights": weights}
     )
-    return prepare_weights(settings, images(), REGION, frames=frames, images_of=images_of or (lambda _: images()))
+    return prepare_weights(settings, lights=("a", "b"), shape=SHAPE, frames=2)
 
 
 @pytest.mark.parametrize("method", ["statistics", "none"])
@@ -57,24 +53,9 @@ def test_a_threshold_excludes_what_is_bright_in_either_state():
     assert not weights.notes
 
 
-def unreadable(index):
-    raise FrameError(f"frame {index} is damaged")
-
-
-@pytest.mark.parametrize(
-    ("images_of", "frames", "message"),
-    [
-        (None, 1, "there is no deformed frame"),
-        (None, 2, "no disturbed zone in frame 1"),
-        (unreadable, 2, "frame 1 cannot be used: frame 1 is damaged"),
-    ],
-)
-def test_where_no_threshold_is_found_the_paper_s_is_taken_and_told(caplog, images_of, frames, message):
-    with caplog.at_level(logging.WARNING, logger="rgbmidic.weights"):
-        weights = prepared(images_of, frames=frames, method="threshold", threshold="auto")
-    assert message in caplog.text
-    assert weights.threshold == pytest.approx(FALLBACK)
-    assert weights.notes == {"weights_threshold": weights.threshold}
+def test_an_automatic_threshold_takes_the_frames_of_a_test():
+    with pytest.raises(ConfigurationError, match=r'weights.threshold = "auto" is found from the frames of a test'):
+        prepared(method="threshold", threshold="auto")
 
 
 @pytest.mark.parametrize("method", ["statistics", "threshold"])

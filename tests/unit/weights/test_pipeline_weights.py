@@ -90,7 +90,7 @@ def test_a_scene_of_another_camera_stops_the_job_before_anything_is_written(fold
 
 
 def test_where_nothing_is_disturbed_the_automatic_threshold_is_the_paper_s_and_says_so(folder, tmp_path, caplog):
-    with caplog.at_level(logging.WARNING, logger="rgbmidic.weights"):
+    with caplog.at_level(logging.WARNING, logger="rgbmidic.pipeline"):
         result = run(folder, tmp_path / "auto", method="threshold", threshold="auto")
     assert result.provenance["weights_threshold"] == pytest.approx(FALLBACK)
     assert "no disturbed zone" in caplog.text

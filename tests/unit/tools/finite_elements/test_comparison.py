@@ -14,8 +14,8 @@ from results import make_result
 from rgbmidic import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.cli import app as cli
 from rgbmidic.cli.command import execute
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.tools.finite_elements import measured_mesh
 from rgbmidic.tools.finite_elements.comparison import Comparison

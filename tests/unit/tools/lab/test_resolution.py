@@ -128,7 +128,7 @@ def test_the_spatial_resolution_is_that_of_a_wave_measured_on_the_mesh():
         np.add.at(right, nodes[:, a], shape[:, a] * wave)
         for b in range(3):
             np.add.at(normal, (nodes[:, a], nodes[:, b]), shape[:, a] * shape[:, b])
-    from rgbmidic.correlation.recovery import Recovery
+    from rgbmidic.mesh.recovery import Recovery
 
     every = np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes))
     recovered = Recovery.over(mesh, *every).value @ np.linalg.solve(normal, right)

@@ -12,13 +12,13 @@ import pytest
 from rgbmidic import correlate
 from rgbmidic._kernels.correlation import element_vector
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.linear import LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.tools.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
 from rgbmidic.tools.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.tools.scene.forecast import Instrument, nodal_variance_factor, trace_change

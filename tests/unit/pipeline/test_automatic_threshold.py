@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from functools import cache
 
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 
 from bench import lamp_for_reflection
+from rgbmidic.errors import FrameError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import linearise
 from rgbmidic.mesh import Region
+from rgbmidic.pipeline.automatic_threshold import automatic_threshold, automatic_weights
+from rgbmidic.settings import TestSettings
 from rgbmidic.tools.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
 from rgbmidic.tools.scene.camera import reference_camera
-from rgbmidic.weights.threshold import automatic_threshold, threshold_weights
+from rgbmidic.weights.threshold import FALLBACK, threshold_weights
 
 SIZE, SPOT = 300, (80.0, 150.0)
 
@@ -89,3 +93,33 @@ def test_images_that_do_not_match_give_no_threshold():
 def test_the_threshold_goes_with_the_blur_of_the_weights(blur):
     found = automatic_threshold(*states(1.5), REGION, blur=blur, element_size=16.0, prefilter="none")
     assert found.value == pytest.approx(find(1.5).value, rel=0.3)
+
+
+def images_without_reflection() -> IlluminationImages:
+    values = np.full((2, 60, 80), 100.0, dtype=np.float32)
+    return IlluminationImages(values=values, valid=values > 0, names=("a", "b"), full_scale=1000.0)
+
+
+def unreadable(index):
+    raise FrameError(f"frame {index} is damaged")
+
+
+@pytest.mark.parametrize(
+    ("images_of", "frames", "message"),
+    [
+        (lambda _: images_without_reflection(), 1, "there is no deformed frame"),
+        (lambda _: images_without_reflection(), 2, "no disturbed zone in frame 1"),
+        (unreadable, 2, "frame 1 cannot be used: frame 1 is damaged"),
+    ],
+)
+def test_where_no_threshold_is_found_the_paper_s_is_taken_and_told(caplog, images_of, frames, message):
+    blank = images_without_reflection()
+    settings = TestSettings.from_mapping(
+        {"frames": {"path": "x"}, "region": {"rectangle": [0, 0, 79, 59]}, "calibration": {"file": "c"}}
+    )
+    region = Region.from_rectangle((0, 0, 79, 59), blank.shape)
+    with caplog.at_level(logging.WARNING, logger="rgbmidic.pipeline"):
+        weights = automatic_weights(settings, blank, region, frames=frames, images_of=images_of)
+    assert message in caplog.text
+    assert weights.threshold == pytest.approx(FALLBACK)
+    assert weights.notes == {"weights_threshold": weights.threshold}

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import at_pixels
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.recovery import Recovery
 
 SIZE = 10.0
 GAIN = {3: (0.90, 1.03), 4: (0.97, 1.03), 6: (0.99, 1.02)}
