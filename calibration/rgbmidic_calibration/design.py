@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, read_columns
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.tools.scene.spectra import Led, Sensitivities, read_columns
 from rgbmidic.typing import FloatArray
 
 

@@ -15,11 +15,12 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration, distorted
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, reported
-from rgbmidic.illumination.crosstalk import Crosstalk, Sensitivities
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.report.style import literal, save_figure
+from rgbmidic.tools.scene.spectra import Sensitivities
 from rgbmidic.tools.stereo import PAIR_PARAMETERS, CameraPair
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate

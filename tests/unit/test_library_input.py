@@ -16,13 +16,14 @@ from rgbmidic import Calibration, CameraCalibration, FiniteElementMesh, Placemen
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.frames import Mosaic, list_frames, write_dng
 from rgbmidic.illumination import linearise
-from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, Sensitivities
+from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import Quantity
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.tools.lab.inspection import inspect_frame
 from rgbmidic.tools.scene.camera import rotation
 from rgbmidic.tools.scene.scene import State
+from rgbmidic.tools.scene.spectra import Sensitivities
 from rgbmidic.tools.scene.surface import AffineField, MeshField, Surface, height_map
 from rgbmidic.typing import as_numbers
 

@@ -17,11 +17,12 @@ import numpy.typing as npt
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
-from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.tools.scene import SceneSection
+from rgbmidic.tools.scene.spectra import Led, Sensitivities, spectral_response
 from rgbmidic.typing import FloatArray
 
 NOMINAL_DISTANCE = 600.0

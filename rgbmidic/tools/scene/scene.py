@@ -15,7 +15,6 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.settings import (
     ELEMENT_SIZE,
     check_names,
@@ -37,6 +36,7 @@ from rgbmidic.tools.scene.camera import (
     rotation,
     three_lights,
 )
+from rgbmidic.tools.scene.spectra import Led, Sensitivities
 from rgbmidic.tools.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.typing import FloatArray
 

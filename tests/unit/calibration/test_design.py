@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic.tools.scene.camera import MEASURED_CROSSTALK
+from rgbmidic.tools.scene.spectra import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, read_camera, read_lamp
 from rgbmidic_calibration.display import draw_design
 

@@ -1,6 +1,5 @@
 """Virtual experiments: ray-traced painted bodies under coloured lights, seen by a colour camera, with exact truth."""
 
-from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.tools.lab.virtual.dataset import record
 from rgbmidic.tools.lab.virtual.rendering import (
     expose,
@@ -13,6 +12,7 @@ from rgbmidic.tools.lab.virtual.rendering import (
 )
 from rgbmidic.tools.scene.camera import Camera, Light, Polarisers, reference_camera
 from rgbmidic.tools.scene.scene import Cylinder, Plate, Scene, Sphere, State
+from rgbmidic.tools.scene.spectra import Led, Sensitivities
 from rgbmidic.tools.scene.surface import AffineField, Finish, MeshField, Surface, height_map
 from rgbmidic.tools.scene.zones import material_points, truth
 

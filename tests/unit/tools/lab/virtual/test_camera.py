@@ -7,7 +7,6 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, spectral_response
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.tools.lab.virtual import (
     Camera,
@@ -22,6 +21,7 @@ from rgbmidic.tools.lab.virtual import (
 )
 from rgbmidic.tools.lab.virtual.dataset import dark_frames, single_light_frames
 from rgbmidic.tools.scene.camera import mosaic_samples
+from rgbmidic.tools.scene.spectra import HALF_MAXIMUM, spectral_response
 
 LIGHTS = tuple(Light(name=name, position=(0.0, 0.0, 0.0)) for name in ("red", "green", "blue"))
 CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
