@@ -18,10 +18,10 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
-from rgbmidic.typing import BoolArray, IntArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -60,20 +60,13 @@ def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct]:
     return files, struct.Struct(f"<{entries}{_END_BYTES}x{_COMMENT.format.lstrip('<')}")
 
 
-T_co = TypeVar("T_co", covariant=True)
-
-
-class _Holder(Protocol[T_co]):
-    def _quantity(self, name: str, /) -> T_co: ...
-
-
 class _Attribute:
     """A quantity of the table as an attribute of what holds it."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
 
-    def __get__(self, holder: _Holder[T_co], owner: type | None = None) -> T_co:
+    def __get__(self, holder: Any, owner: type | None = None) -> Any:
         if holder is None:  # asked of the class, by documentation
             raise AttributeError(self._name)
         return holder._quantity(self._name)
@@ -83,41 +76,39 @@ class QuantityAttributes:
     """Quantities with one shape in all frames as attributes: of all frames in a result, of one in a record."""
 
     __slots__ = ()
-    number = _Attribute()
-    time_ns = _Attribute()
-    status = _Attribute()
-    unread = _Attribute()
-    tries = _Attribute()
-    iterations = _Attribute()
-    checksum = _Attribute()
-    node_status = _Attribute()
-    u = _Attribute()
-    v = _Attribute()
-    u_std = _Attribute()
-    v_std = _Attribute()
-    u_bias_std = _Attribute()
-    v_bias_std = _Attribute()
-    u_edge_std = _Attribute()
-    v_edge_std = _Attribute()
-    nodal_exx = _Attribute()
-    nodal_eyy = _Attribute()
-    nodal_exy = _Attribute()
-    nodal_exx_std = _Attribute()
-    nodal_eyy_std = _Attribute()
-    nodal_exy_std = _Attribute()
-    u_mesh_error = _Attribute()
-    v_mesh_error = _Attribute()
-    nodal_exx_mesh_error = _Attribute()
-    nodal_eyy_mesh_error = _Attribute()
-    nodal_exy_mesh_error = _Attribute()
-    match = _Attribute()
-    best_match = _Attribute()
-    misfit = _Attribute()
-    light_fraction = _Attribute()
-    residual = _Attribute()
-    weight_fraction = _Attribute()
-    brightness = _Attribute()
-    seconds = _Attribute()
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurement:
+    """A solved frame: its solution, and the quantities without a `ResultQuantity.source` by their names.
+
+    Attributes
+    ----------
+    solution
+        Displacement and all that the solve gives.
+    number, time_ns, brightness, match, best_match, reference_updates, weights_thumbnail, reflection_thumbnail, seconds
+        See `QUANTITIES`; None where not known.
+    inputs
+        SHA-256 of each file that the frame was read from, by its path.
+    """
+
+    solution: Solution
+    number: int
+    time_ns: int | None
+    warnings: Sequence[str]
+    inputs: Mapping[str, str]
+    machine: str
+    checksum: int
+    match: float
+    best_match: float
+    reference_updates: Sequence[int]
+    brightness: FloatArray
+    weights_thumbnail: AnyArray
+    reflection_thumbnail: AnyArray | None
+    seconds: Sequence[float] | None = None
 
 
 @state_new_names
@@ -145,15 +136,6 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
 
     values: Mapping[str, Any]
     sizes: Mapping[str, int]
-    reason = _Attribute()
-    warnings = _Attribute()
-    history = _Attribute()
-    inputs = _Attribute()
-    machine = _Attribute()
-    reference_updates = _Attribute()
-    rigid = _Attribute()
-    weights_thumbnail = _Attribute()
-    reflection_thumbnail = _Attribute()
 
     def __post_init__(self) -> None:
         """Check names and shapes, and take over the types of the table."""
@@ -187,27 +169,26 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
         return cls(values=blank | quantities, sizes=sizes)
 
     @classmethod
-    def from_solution(cls, solution: Solution, **quantities: Any) -> FrameRecord:
+    def from_measurement(cls, measurement: Measurement) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
-        solution
-            Provides the quantities that have a `ResultQuantity.source`.
-        **quantities
-            The others, such as `number`, `time_ns`, `inputs` and `weights_thumbnail`, as in `from_values`.
+        measurement
+            Its solution, from which the quantities that have a `ResultQuantity.source` are taken, and the others.
 
         Returns
         -------
         FrameRecord
         """
+        values = {field.name: getattr(measurement, field.name) for field in fields(measurement)}
+        solution: Solution = values.pop("solution")
         nodes, lights = np.shape(solution.light_fraction)
-        entries = [entry for entry in QUANTITIES.values() if entry.source]
-        if not np.isfinite(solution.displacement_error).any():
-            entries = [entry for entry in entries if not entry.is_estimated]
-        return cls.from_values(
-            nodes=nodes, lights=lights, **{entry.name: entry.read_from(solution) for entry in entries}, **quantities
-        )
+        has_error = np.isfinite(solution.displacement_error).any()
+        for entry in QUANTITIES.values():
+            if entry.source and (has_error or not entry.is_estimated):
+                values[entry.name] = entry.read_from(solution)
+        return cls.from_values(nodes=nodes, lights=lights, **values)
 
     @classmethod
     def failed(cls, reason: str, *, nodes: int, lights: int, **quantities: Any) -> FrameRecord:
@@ -237,6 +218,11 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
 
     def _quantity(self, name: str, /) -> Any:
         return self.values[name]
+
+
+for _entry in QUANTITIES.values():
+    _holder = QuantityAttributes if _entry.is_stackable or _entry.is_estimated else FrameRecord
+    setattr(_holder, _entry.name, _Attribute(_entry.name))
 
 
 def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:
@@ -300,12 +286,12 @@ def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> di
         content = file.read()
         if len(content) != directory.size or zlib.crc32(content[:-4]).to_bytes(4, "little") != content[-4:]:
             raise ResultError("its directory is damaged or cut off")
-        *fields, owner, number = directory.unpack(content)
+        *numbers, owner, number = directory.unpack(content)
         if owner != run:
             raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {RESTORE_REMEDY}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
-        iterator = iter(fields)
+        iterator = iter(numbers)
         entries, values = dict(zip(files, zip(iterator, iterator, iterator, iterator, strict=True), strict=True)), {}
         for name in names:
             method, check, length, offset = entries[name]
