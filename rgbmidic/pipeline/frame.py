@@ -44,6 +44,7 @@ from rgbmidic.pipeline.frame_quality import (
 from rgbmidic.pipeline.order import STRIDE, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
+from rgbmidic.results.records import Measurement
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -116,9 +117,9 @@ def measure_frame_safely(plan: Plan, index: int, start: TrackingState, updated: 
     """Measure a frame as `measure_frame`, which gives the record alone."""
     try:
         with record_stages(plan.timings) as seconds:
-            values = solve_frame(plan, index, start, _reference_of(plan, updated))
-        record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
-        return FrameOutcome(record=record, solution=values["solution"])
+            measurement = solve_frame(plan, index, start, _reference_of(plan, updated))
+        record = FrameRecord.from_measurement(replace(measurement, seconds=list(seconds.values()) or None))
+        return FrameOutcome(record=record, solution=measurement.solution)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
     except Exception as error:  # whatever it is, the other frames can be measured
@@ -178,8 +179,8 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         raise _UnreadError(str(error)) from error
 
 
-def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: ReferenceUpdate) -> dict[str, Any]:
-    """Measure a frame: return the arguments of `FrameRecord.from_solution`, the ``solution`` and what else is recorded.
+def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: ReferenceUpdate) -> Measurement:
+    """Measure a frame.
 
     Parameters
     ----------
@@ -238,26 +239,28 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     brightness = brightness_change(plan.images.values, images.values, reference, displacement)
     for light, _ in _dimmed_lights(images.names, brightness):
         warnings.append(f"{light} gives less than {LEAST_GAIN:.0%} of its light in the reference")
-    match, best, reference_updates = _compare_with_reference(plan, index, start, reference_update, deformed, solution)
-    if len(reference_updates) > len(start.reference_updates):
+    match, best, becomes_reference = _compare_with_reference(plan, index, start, reference_update, deformed, solution)
+    reference_updates = start.reference_updates
+    if becomes_reference:
+        reference_updates = (*reference_updates, position)
         warnings.append("becomes the reference of those after it")
-    warnings += _blur_warning(plan, index, start, solution)
+    warnings += _blur_warning(plan, position, start, solution)
     reflection = images.reflection_index(step, reference_slices)
-    return {
-        "solution": filled,
-        "warnings": warnings,
-        "number": plan.series.numbers[index],
-        "time_ns": plan.series.time_ns(index),
-        "brightness": brightness,
-        "match": match,
-        "best_match": best,
-        "reference_updates": reference_updates,
-        "weights_thumbnail": thumbnail,
-        "reflection_thumbnail": None if reflection is None else _to_uint8(reflection),
-        "inputs": inputs,
-        "machine": machine(),
-        "checksum": checksum(windowed_state),
-    }
+    return Measurement(
+        solution=filled,
+        number=plan.series.numbers[index],
+        time_ns=plan.series.time_ns(index),
+        warnings=warnings,
+        inputs=inputs,
+        machine=machine(),
+        checksum=checksum(windowed_state),
+        match=match,
+        best_match=best,
+        reference_updates=reference_updates,
+        brightness=brightness,
+        weights_thumbnail=thumbnail,
+        reflection_thumbnail=None if reflection is None else _to_uint8(reflection),
+    )
 
 
 def checksum(state: RawState) -> int:
@@ -315,16 +318,15 @@ def _compare_with_reference(
     reference_update: ReferenceUpdate,
     deformed: Deformed,
     solution: Solution,
-) -> tuple[float, float, tuple[int, ...]]:
-    """Return how well a frame matches its reference, the best match of frames on it, and the next reference updates."""
+) -> tuple[float, float, bool]:
+    """Return how well a frame matches its reference, the best match up to it, and whether it becomes the reference."""
     if not (plan.settings.frames.update_reference and solution.measured.any()):
-        return float("nan"), start.best_match, start.reference_updates
+        return float("nan"), start.best_match, False
     match = reference_update.match(deformed, solution)
     median = float(np.nanmedian(match)) if np.isfinite(match).any() else float("nan")
     best = float(np.fmax(start.best_match, np.float32(median)))
-    if index in plan.settings.frames.reference or not reference_update.is_due(match, best):
-        return median, best, start.reference_updates
-    return median, 0.0, (*start.reference_updates, plan.series.selected.index(index))
+    is_due = index not in plan.settings.frames.reference and reference_update.is_due(match, best)
+    return median, 0.0 if is_due else best, is_due
 
 
 def _dimmed_lights(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
@@ -348,9 +350,8 @@ def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
     return warnings
 
 
-def _blur_warning(plan: Plan, index: int, start: TrackingState, solution: Solution) -> list[str]:
+def _blur_warning(plan: Plan, position: int, start: TrackingState, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
-    position = plan.series.selected.index(index)
     if (
         parent(position) != position - 1
         or start.displacement is None
@@ -358,7 +359,7 @@ def _blur_warning(plan: Plan, index: int, start: TrackingState, solution: Soluti
         or not plan.exposure
     ):
         return []
-    before = plan.series.selected[position - 1]
+    before, index = plan.series.selected[position - 1], plan.series.selected[position]
     times = [plan.series.time_ns(number) for number in (before, index)]
     rate = plan.settings.scale.frame_rate or plan.series.recording.frame_rate
     if None not in times:

@@ -2,23 +2,26 @@
 
 ``000007.npz`` holds every quantity of frame 7, for `numpy.load` and others: a zip archive with a CRC-32 of every array,
 its directory at the end. All records have the same arrays in the same order, so that the directory is one structure of
-fixed length: a quantity is found without a look at the others, which `zipfile` takes (0.04 instead of 0.18 ms a frame;
-to write one 0.4 instead of 1.6 ms). The archive's comment holds the digest of the run, the frame, and a CRC-32 of the
-directory and these. A record that is replaced or discarded is gone at once; nothing is ever written into a file.
+fixed length: a quantity is found without a look at the others, which `zipfile` takes (0.04 instead of 0.16 ms a frame,
+0.4 instead of 1.0 ms for the history of a point). The archive's comment holds the digest of the run, the frame, and a
+CRC-32 of the directory and these. A record that is replaced or discarded is gone at once; nothing is ever written into
+a file.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -29,7 +32,7 @@ from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
-from rgbmidic.typing import BoolArray, IntArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -37,43 +40,33 @@ if TYPE_CHECKING:
 FRAMES = "solution"
 """Folder of the records in that of a result."""
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
-_LOCAL = struct.Struct("<4s5H3I2H")
-"""What precedes the name and content of an array; this and the following: PKWARE's APPNOTE.TXT 6.3, 4.3.7 to 4.3.16."""
-_CHECK, _END_BYTES, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struct.calcsize("<16sQI")
-_VERSION, _DATE = 20, 0x21
-"""Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
-_STORED, _DEFLATED = 0, 8
+_LOCAL_BYTES, _END_BYTES = struct.calcsize("<4s5H3I2H"), struct.calcsize("<4s4H2IH")
+"""What precedes the name of an array and its content, and what ends the directory: PKWARE's APPNOTE.TXT 6.3, 4.3."""
+_COMMENT = struct.Struct("<16sQ4x")
+"""Digest of the run, frame, and room for the checksum."""
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run --resume` measures it again, `partial=True` reads the rest"
 
 
 @lru_cache(maxsize=4)
-def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, struct.Struct]:
+def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct]:
     """Lay out the directory of every record.
 
-    Returns the name of each array in the archive, by its quantity; the directory, its end, and the comment without its
-    checksum; and what is read of them: method, CRC-32, bytes and place of every array, run and frame.
+    Returns the name of each array in the archive, by its quantity; and what is read of the directory, its end and the
+    comment: method, CRC-32, bytes and place of every array, run and frame.
     """
     files = {name: f"{QUANTITIES[name].file_name}.npy".encode() for name in names}
-    directory_format = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
-    fields_format = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
-    return files, struct.Struct(f"<{directory_format}4s4H2IH16sQ"), struct.Struct(f"<{fields_format}{_END_BYTES}x16sQ")
-
-
-T_co = TypeVar("T_co", covariant=True)
-
-
-class _Holder(Protocol[T_co]):
-    def _quantity(self, name: str, /) -> T_co: ...
+    entries = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
+    return files, struct.Struct(f"<{entries}{_END_BYTES}x{_COMMENT.format.lstrip('<')}")
 
 
 class _Attribute:
     """A quantity of the table as an attribute of what holds it."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
 
-    def __get__(self, holder: _Holder[T_co], owner: type | None = None) -> T_co:
+    def __get__(self, holder: Any, owner: type | None = None) -> Any:
         if holder is None:  # asked of the class, by documentation
             raise AttributeError(self._name)
         return holder._quantity(self._name)
@@ -83,41 +76,39 @@ class QuantityAttributes:
     """Quantities with one shape in all frames as attributes: of all frames in a result, of one in a record."""
 
     __slots__ = ()
-    number = _Attribute()
-    time_ns = _Attribute()
-    status = _Attribute()
-    unread = _Attribute()
-    tries = _Attribute()
-    iterations = _Attribute()
-    checksum = _Attribute()
-    node_status = _Attribute()
-    u = _Attribute()
-    v = _Attribute()
-    u_std = _Attribute()
-    v_std = _Attribute()
-    u_bias_std = _Attribute()
-    v_bias_std = _Attribute()
-    u_edge_std = _Attribute()
-    v_edge_std = _Attribute()
-    nodal_exx = _Attribute()
-    nodal_eyy = _Attribute()
-    nodal_exy = _Attribute()
-    nodal_exx_std = _Attribute()
-    nodal_eyy_std = _Attribute()
-    nodal_exy_std = _Attribute()
-    u_mesh_error = _Attribute()
-    v_mesh_error = _Attribute()
-    nodal_exx_mesh_error = _Attribute()
-    nodal_eyy_mesh_error = _Attribute()
-    nodal_exy_mesh_error = _Attribute()
-    match = _Attribute()
-    best_match = _Attribute()
-    misfit = _Attribute()
-    light_fraction = _Attribute()
-    residual = _Attribute()
-    weight_fraction = _Attribute()
-    brightness = _Attribute()
-    seconds = _Attribute()
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurement:
+    """A solved frame: its solution, and the quantities without a `ResultQuantity.source` by their names.
+
+    Attributes
+    ----------
+    solution
+        Displacement and all that the solve gives.
+    number, time_ns, brightness, match, best_match, reference_updates, weights_thumbnail, reflection_thumbnail, seconds
+        See `QUANTITIES`; None where not known.
+    inputs
+        SHA-256 of each file that the frame was read from, by its path.
+    """
+
+    solution: Solution
+    number: int
+    time_ns: int | None
+    warnings: Sequence[str]
+    inputs: Mapping[str, str]
+    machine: str
+    checksum: int
+    match: float
+    best_match: float
+    reference_updates: Sequence[int]
+    brightness: FloatArray
+    weights_thumbnail: AnyArray
+    reflection_thumbnail: AnyArray | None
+    seconds: Sequence[float] | None = None
 
 
 @state_new_names
@@ -145,15 +136,6 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
 
     values: Mapping[str, Any]
     sizes: Mapping[str, int]
-    reason = _Attribute()
-    warnings = _Attribute()
-    history = _Attribute()
-    inputs = _Attribute()
-    machine = _Attribute()
-    reference_updates = _Attribute()
-    rigid = _Attribute()
-    weights_thumbnail = _Attribute()
-    reflection_thumbnail = _Attribute()
 
     def __post_init__(self) -> None:
         """Check names and shapes, and take over the types of the table."""
@@ -187,27 +169,26 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
         return cls(values=blank | quantities, sizes=sizes)
 
     @classmethod
-    def from_solution(cls, solution: Solution, **quantities: Any) -> FrameRecord:
+    def from_measurement(cls, measurement: Measurement) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
-        solution
-            Provides the quantities that have a `ResultQuantity.source`.
-        **quantities
-            The others, such as `number`, `time_ns`, `inputs` and `weights_thumbnail`, as in `from_values`.
+        measurement
+            Its solution, from which the quantities that have a `ResultQuantity.source` are taken, and the others.
 
         Returns
         -------
         FrameRecord
         """
+        values = {field.name: getattr(measurement, field.name) for field in fields(measurement)}
+        solution: Solution = values.pop("solution")
         nodes, lights = np.shape(solution.light_fraction)
-        entries = [entry for entry in QUANTITIES.values() if entry.source]
-        if not np.isfinite(solution.displacement_error).any():
-            entries = [entry for entry in entries if not entry.is_estimated]
-        return cls.from_values(
-            nodes=nodes, lights=lights, **{entry.name: entry.read_from(solution) for entry in entries}, **quantities
-        )
+        has_error = np.isfinite(solution.displacement_error).any()
+        for entry in QUANTITIES.values():
+            if entry.source and (has_error or not entry.is_estimated):
+                values[entry.name] = entry.read_from(solution)
+        return cls.from_values(nodes=nodes, lights=lights, **values)
 
     @classmethod
     def failed(cls, reason: str, *, nodes: int, lights: int, **quantities: Any) -> FrameRecord:
@@ -237,6 +218,11 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
 
     def _quantity(self, name: str, /) -> Any:
         return self.values[name]
+
+
+for _entry in QUANTITIES.values():
+    _holder = QuantityAttributes if _entry.is_stackable or _entry.is_estimated else FrameRecord
+    setattr(_holder, _entry.name, _Attribute(_entry.name))
 
 
 def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:
@@ -273,19 +259,16 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
     ResultError
         The disk is full or refuses, or the check fails; nothing is left of the frame.
     """
-    (files, directory, _), chunks, entries, offset = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
-    for name, file in files.items():
-        content = npy_bytes(record.values[name])
-        picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].is_stackable
-        payload = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
-        method, sizes = _DEFLATED if picture else _STORED, (len(payload), len(content), len(file), 0)
-        header = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
-        chunks += _LOCAL.pack(b"PK\x03\x04", *header), file, payload
-        entries += b"PK\x01\x02", _VERSION, *header, 0, 0, 0, 0, offset, file
-        offset += _LOCAL.size + len(file) + len(payload)
-    count, length = len(files), directory.size + _CHECK.size - _COMMENT - _END_BYTES
-    tail = directory.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, offset, _COMMENT, run, frame)
-    content = b"".join([*chunks, tail, _CHECK.pack(zlib.crc32(tail))])
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, entry in QUANTITIES.items():
+            is_picture = entry.dtype is np.uint8 and not entry.is_stackable
+            method = zipfile.ZIP_DEFLATED if is_picture else zipfile.ZIP_STORED
+            file_info = zipfile.ZipInfo(f"{entry.file_name}.npy")  # without a date: the same bits each time
+            archive.writestr(file_info, npy_bytes(record.values[name]), method, zlib.Z_BEST_SPEED)
+        archive.comment = _COMMENT.pack(run, frame)
+    content = buffer.getbuffer()
+    content[-4:] = zlib.crc32(content[archive.start_dir : -4]).to_bytes(4, "little")
 
     def write(file: BinaryIO) -> None:
         check()
@@ -296,25 +279,25 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
 
 def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
-    files, directory, fields_struct = _layout(tuple(QUANTITIES))
+    files, directory = _layout(tuple(QUANTITIES))
     with require_regular_file(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - directory.size - _CHECK.size, 0))
-        tail = file.read()
-        if len(tail) < directory.size or _CHECK.pack(zlib.crc32(tail[: directory.size])) != tail[directory.size :]:
+        file.seek(max(size - directory.size, 0))
+        content = file.read()
+        if len(content) != directory.size or zlib.crc32(content[:-4]).to_bytes(4, "little") != content[-4:]:
             raise ResultError("its directory is damaged or cut off")
-        *fields, owner, number = fields_struct.unpack(tail[: directory.size])
+        *numbers, owner, number = directory.unpack(content)
         if owner != run:
             raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {RESTORE_REMEDY}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
-        iterator = iter(fields)
+        iterator = iter(numbers)
         entries, values = dict(zip(files, zip(iterator, iterator, iterator, iterator, strict=True), strict=True)), {}
         for name in names:
             method, check, length, offset = entries[name]
-            file.seek(offset + _LOCAL.size + len(files[name]))
+            file.seek(offset + _LOCAL_BYTES + len(files[name]))
             content = file.read(min(length, size))
-            content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == _DEFLATED else content
+            content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == zipfile.ZIP_DEFLATED else content
             if zlib.crc32(content) != check:
                 raise ResultError(f"the checksum of {name} is wrong")
             array = npy_array(content)

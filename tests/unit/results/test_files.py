@@ -151,6 +151,19 @@ def test_a_damaged_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.Lo
         finish_result(whole.path)
 
 
+def test_a_record_of_the_former_writer_is_read(copy: Path) -> None:
+    """It stated neither a system nor the rights of a file, which `zipfile` does."""
+    file, expected = copy / "solution" / "000001.npz", Result.open(copy).frame(1).values
+    content = bytearray(file.read_bytes())
+    places = [i for i in range(len(content)) if content.startswith(b"PK\x01\x02", i)]
+    for i in places:
+        content[i + 4 : i + 6], content[i + 38 : i + 42] = b"\x14\0", bytes(4)
+    content[-4:] = zlib.crc32(content[places[0] : -4]).to_bytes(4, "little")
+    assert content != file.read_bytes()
+    file.write_bytes(content)
+    np.testing.assert_equal(dict(Result.open(copy).frame(1).values), dict(expected))
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
 def test_a_pipe_in_the_place_of_a_record_is_not_waited_for(copy: Path) -> None:
     (copy / "solution" / "000001.npz").unlink()
