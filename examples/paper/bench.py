@@ -194,7 +194,7 @@ class Bench:
             registration=camera.true_registration(lights),
         )
         if demosaic != "auto":
-            return separate(frames[0], calibration, demosaic)
+            return separate(frames[0], calibration, demosaic).on_first_light()
         return Separation(calibration=calibration)(frames)
 
 

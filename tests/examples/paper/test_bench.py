@@ -91,3 +91,10 @@ def test_what_the_bench_does_not_have_is_refused():
         Bench.build("stereo")
     with pytest.raises(InputError, match="at least 448"):
         Bench.build("bayer", 300)
+
+
+def test_the_paper_s_methods_get_the_lights_of_a_mosaic_on_one_grid() -> None:
+    bench = Bench.build("bayer", 448)
+    images = np.full((len(bench.scene.lights), 448, 448), 1000.0, dtype=np.float32)
+    assert bench.photograph(images, 0).registration is None
+    assert bench.photograph(images, 0, "auto").registration is not None
