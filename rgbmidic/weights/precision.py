@@ -24,6 +24,7 @@ class Precision:
 
     Examples
     --------
+    >>> import numpy as np
     >>> Precision(factor=np.ones((3, 100), np.float32), loss_curvature=np.ones(100, np.float32)).factor.shape
     (3, 100)
     """
