@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from typer import Argument, Option
@@ -51,15 +51,13 @@ def stereo(
     """Measure shape, motion and surface strain in three dimensions with two cameras."""
     from rgbmidic.tools.stereo import StereoSettings, measure_stereo
 
-    if pairing not in ("auto", "number"):
-        raise InputError(f"--pairing is auto or number, not {pairing!r}")
     if overwrite and resume:
         raise InputError("--overwrite begins anew, --resume goes on: state one of them")
     settings = StereoSettings(
         axes=_read_axes(axes),
         gauge=gauge,
         measure=measure or "green-lagrange",
-        pairing="number" if pairing == "number" else "auto",
+        pairing=cast("Any", pairing),  # checked there
     )
     try:
         with progress_bar("measuring") as progress:

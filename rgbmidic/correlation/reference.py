@@ -280,7 +280,7 @@ class Reference(Derivable):
         Raises
         ------
         InputError
-            The region belongs to images of another size; unknown prefilter.
+            The region belongs to images of another size; unknown prefilter; grey levels without a gain.
         """
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
@@ -669,11 +669,17 @@ def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
 def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float | None) -> FloatImage:
     """Local means (k, P) of grey levels in windows of `sigma` px, at least `DARK` of the largest; None: over all."""
     level = np.empty_like(values)
-    for f, w, out in zip(values, weights, level, strict=True):
+    for light, (f, w, out) in enumerate(zip(values, weights, level, strict=True)):
         if sigma is None:
             out[:] = abs((w * f).sum(dtype=np.float64)) / max(w.sum(dtype=np.float64), 1e-30) or 1.0
         else:
             window = SlidingWindow(sigma=sigma)
             out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
+            if (negative := float((w * (out <= 0)).sum())) > 0.1 * (total := float(w.sum())):
+                raise InputError(
+                    f"image {light + 1} of the reference has local means of 0 or less in {negative / total:.0%} of the "
+                    "region, which show no gain: grey levels are counted from black (add one number to all images), or "
+                    'state brightness = "constant"'
+                )
             np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
     return level

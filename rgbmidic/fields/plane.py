@@ -10,7 +10,6 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,7 @@ import numpy as np
 from rgbmidic.arguments import checked
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
-from rgbmidic.illumination.calibration import read_document, write_document
+from rgbmidic.illumination.calibration import has_schema, read_document, write_document
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.source import Plane
@@ -387,10 +386,7 @@ class CameraCalibration(Plane):
         -------
         bool
         """
-        try:
-            return bool(json.loads(path.read_text(encoding="utf-8"))["schema"] == _SCHEMA)
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
+        return has_schema(path, _SCHEMA)
 
     @classmethod
     @checked

@@ -386,6 +386,14 @@ def _size(shape: tuple[int, int]) -> str:
     return f"{shape[1]} x {shape[0]}"
 
 
+def has_schema(path: Path, schema: str) -> bool:
+    """Return whether a JSON file states a schema, whatever else is in it."""
+    try:
+        return bool(json.loads(path.read_text(encoding="utf-8"))["schema"] == schema)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
 def read_document(path: Path | str, description: str, schema: str, version: int) -> dict[str, Any]:
     """Read the document of a JSON file that ``rgbmidic-calibrate`` wrote.
 

@@ -18,7 +18,7 @@ import numpy as np
 from rgbmidic.errors import CalibrationError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.fields.plane import LENS_PARAMETERS, distorted, undistorted
-from rgbmidic.illumination.calibration import read_document, write_document
+from rgbmidic.illumination.calibration import has_schema, read_document, write_document
 from rgbmidic.typing import FloatArray, as_numbers
 
 _SCHEMA, _VERSION = "rgbmidic-stereo", 1
@@ -227,10 +227,7 @@ class CameraPair:
         -------
         bool
         """
-        try:
-            return f'"{_SCHEMA}"' in path.read_text(encoding="utf-8")[:200]
-        except (OSError, ValueError):
-            return False
+        return has_schema(path, _SCHEMA)
 
     @classmethod
     def read(cls, path: Path | str) -> Self:

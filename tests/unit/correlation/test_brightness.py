@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from textures import Affine, Texture
 
 from rgbmidic import Status, correlate
@@ -11,6 +12,7 @@ from rgbmidic._kernels.correlation import corrected_vector, element_vector
 from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.brightness import Brightness, GainFit, gain_and_offset
 from rgbmidic.correlation.constants import USUAL
+from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 SHAPE = (160, 200)
@@ -120,3 +122,11 @@ def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
     values, weight = np.random.default_rng(3).uniform(0, 1, (2, pixels.columns.size)).astype(np.float32)
     found = pixels.weighted_block_sums(values, weight, 4, with_weight=True)
     np.testing.assert_allclose(found, pixels.block_sums(np.stack([weight * values, weight]), 4), rtol=1e-6)
+
+
+def test_images_about_zero_have_no_gain_and_are_refused_in_one_line() -> None:
+    speckle = gaussian_filter(np.random.default_rng(0).normal(size=(80, 80)), 2) * 300
+    pair = speckle, np.roll(speckle, 1, axis=1)
+    with pytest.raises(InputError, match=r"image 1 of the reference has local means of 0 or less in \d+%"):
+        correlate(*pair, element_size=20)
+    assert correlate(*pair, element_size=20, brightness="constant").measured.any()
