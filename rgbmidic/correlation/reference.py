@@ -311,6 +311,8 @@ class Reference(Derivable):
         if brightness == "auto":
             sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
+        if sigma is not None:
+            weighted *= level > DARK * level.max()  # residuals are relative to it
         inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
         for light, fit in enumerate(fits):
             for axis in light_gradient[:, light]:
@@ -668,18 +670,18 @@ def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
 
 def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float | None) -> FloatImage:
     """Local means (k, P) of grey levels in windows of `sigma` px, at least `DARK` of the largest; None: over all."""
-    level = np.empty_like(values)
+    level, below = np.empty_like(values), np.zeros(len(values))
     for light, (f, w, out) in enumerate(zip(values, weights, level, strict=True)):
         if sigma is None:
             out[:] = abs((w * f).sum(dtype=np.float64)) / max(w.sum(dtype=np.float64), 1e-30) or 1.0
         else:
             window = SlidingWindow(sigma=sigma)
             out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
-            if (negative := float((w * (out <= 0)).sum())) > 0.1 * (total := float(w.sum())):
-                raise InputError(
-                    f"image {light + 1} of the reference has local means of 0 or less in {negative / total:.0%} of the "
-                    "region, which show no gain: grey levels are counted from black (add one number to all images), or "
-                    'state brightness = "constant"'
-                )
+            below[light] = (w * (out <= 0)).sum() / max(w.sum(), np.float32(1e-30))
             np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
+    if below.min() > 0.1:  # one of several lights may be off
+        raise InputError(
+            f"the reference has local means of 0 or less in {below.min():.0%} of the region, which show no gain: grey "
+            'levels are counted from black (add one number to all images), or state brightness = "constant"'
+        )
     return level
