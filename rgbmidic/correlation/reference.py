@@ -677,11 +677,11 @@ def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigm
         else:
             window = SlidingWindow(sigma=sigma)
             out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
-            below[light] = (w * (out <= 0)).sum() / max(w.sum(), np.float32(1e-30))
+            below[light] = (w * (out < 0)).sum() / max(w.sum(), np.float32(1e-30))
             np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
     if below.min() > 0.1:  # one of several lights may be off
         raise InputError(
-            f"the reference has local means of 0 or less in {below.min():.0%} of the region, which show no gain: grey "
+            f"the reference has local means below 0 in {below.min():.0%} of the region, which show no gain: grey "
             'levels are counted from black (add one number to all images), or state brightness = "constant"'
         )
     return level
