@@ -107,27 +107,8 @@ class Field:
         return selected
 
     @classmethod
-    def stack(cls, parts: Sequence[Self], dim: str = "frame") -> Self:
-        """Join fields along a new axis before the last one.
-
-        Parameters
-        ----------
-        parts
-            One field of each frame.
-        dim
-            Name of the new axis.
-
-        Returns
-        -------
-        Field
-        """
-        first, *others = parts
-        stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
-        return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
-
-    @classmethod
-    def join(cls, parts: Sequence[Self], dim: str) -> Self:
-        """Join fields along an axis that they have.
+    def concatenate(cls, parts: Sequence[Self], dim: str = "frame") -> Self:
+        """Join fields along one of their axes, or along a new one before the last.
 
         Parameters
         ----------
@@ -141,8 +122,11 @@ class Field:
         Field
         """
         first, *others = parts
-        axis = first.dims.index(dim) - len(first.dims)
-        return first.with_arrays(lambda *arrays: np.concatenate(arrays, axis=axis), *others)
+        if dim in first.dims:
+            axis = first.dims.index(dim) - len(first.dims)
+            return first.with_arrays(lambda *arrays: np.concatenate(arrays, axis=axis), *others)
+        stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
+        return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
 
     @property
     def is_doubtful(self) -> BoolArray:
@@ -211,13 +195,22 @@ class Displacement(Field):
         )
 
     @property
+    def error_factor(self) -> FloatArray:
+        """Factor F of the covariance ``F F^T`` of the errors at a node, shape (c, c, ..., N); 0 where not known."""
+        if self.covariance is None:
+            std = np.nan_to_num(self.uncertainty)
+            return np.asarray(np.einsum("ij,j...->ij...", np.eye(len(std)), std))
+        roots, axes = np.linalg.eigh(np.moveaxis(np.nan_to_num(self.covariance), (0, 1), (-2, -1)))
+        return np.asarray(np.moveaxis(axes * np.sqrt(np.maximum(roots, 0))[..., None, :], (-2, -1), (0, 1)))
+
+    @property
     def is_measured(self) -> BoolArray:
         """Mask of the nodes all components of which are measured, shape (..., N)."""
         return np.asarray(np.isfinite(self.values + self.uncertainty).all(axis=0))
 
 
 class FieldSource(Protocol):
-    """What histories, profiles, maps, figures, movies and reports read of a result with T frames and N nodes.
+    """A result with T frames and N nodes as histories, profiles, maps, figures, movies and reports read it.
 
     `rgbmidic.results.result_in_units.ResultInUnits` is one, with two components in a plane. A third component is added
     by another source, and by nothing else: its `displacement` has three rows and their covariance, `components` three
@@ -259,7 +252,7 @@ class FieldSource(Protocol):
 
     @property
     def remarks(self) -> Iterable[str]:
-        """What a reader should know of lengths, a line each."""
+        """Remarks on the lengths, a line each."""
 
     @property
     def rectified(self) -> Rectification | None:

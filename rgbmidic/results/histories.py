@@ -275,12 +275,12 @@ def _read_probes(
             displacement = motion.removed(source.mesh.nodes, displacement) if rigid_motion == "remove" else displacement
         for fields, probe in zip(of_probes, probes, strict=True):
             fields.append(displacement.isel(node=probe.nodes))
-    rigid = Field.stack(motions)
+    rigid = Field.concatenate(motions)
     names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid_motion != "none" else {}
     histories = [
         replace(rigid.isel(component=row), name=name, unit=unit) for row, (name, unit) in enumerate(names.items())
     ]
-    return [Displacement.stack(fields) for fields in of_probes], histories, speed
+    return [Displacement.concatenate(fields) for fields in of_probes], histories, speed
 
 
 def convert_history(
