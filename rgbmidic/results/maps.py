@@ -261,17 +261,17 @@ class Maps(Portable):
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
         """Compute a displacement or a rate in the reader's units."""
         if entry.order:
-            components = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
+            parts = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
+            values, std = (np.stack([getattr(part, name) for part in parts]) for name in ("values", "uncertainty"))
+            vector = Displacement(unit=parts[0].unit, dims=("component", "node"), values=values, std=std)
         else:
-            by_name = {component.name: component for component in self.displacement(frame).components}
-            components = [by_name[name] for name in entry.base_quantities]
-        field = components[0]
-        if len(components) > 1:
-            vector, error = (
-                np.stack(terms, axis=1) for terms in zip(*((c.values, c.uncertainty) for c in components), strict=True)
-            )
-            length, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(components)))
-            field = replace(field, values=length, std=std, bias=None)
+            vector = self.displacement(frame)
+            parts = [part for part in vector.components if part.name in entry.base_quantities]
+        field = parts[0]
+        if len(parts) > 1:
+            factor = vector.error_factor
+            length, std = length_of(vector.values.T, np.einsum("irn,jrn->nij", factor, factor))
+            field = replace(field, values=length, std=np.where(vector.is_measured, std, np.nan), bias=None)
         return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
 
     def displacement(self, frame: int) -> Displacement:

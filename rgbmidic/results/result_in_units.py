@@ -121,8 +121,9 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
-    finished = result.finished
-    stamps, numbers = result.time_ns[finished], result.number[finished]
+    finished = np.flatnonzero(result.finished)
+    read = [(values["time_ns"], values["number"]) for values in result.table.iterate(("time_ns", "number"), finished)]
+    stamps, numbers = np.array(read, dtype=np.int64).reshape(-1, 2).T
     if (stamps == UNKNOWN_TIME).any():
         recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
         rate = scale.frame_rate or recorded
@@ -397,15 +398,14 @@ class ResultInUnits(Portable):
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""
         record = next(self.result.table.iterate(None, [index]))
-        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std")
+        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std").std
+        gradient = self.mesh.element_gradient(displacement.values.T)
         strain = self.gauges.strain(displacement, self.measure)
-        elements = self.mesh.element_gradient(displacement.values.T)
-        columns = {name: np.asarray(record[name]) for name in self.columns if name in record}
+        in_elements = unchecked_strain(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
+        columns: dict[str, Any] = {name: np.asarray(record[name]) for name in self.columns if name in record}
         for field in (*map(self.units.convert, displacement.components), *strain.values()):
-            columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
+            columns |= {field.name: field.values, f"{field.name}_std": field.std}
             if field.bias is not None:
                 columns[f"{field.name}_bias_std"] = field.bias
-        for name, std in zip(self.components, self.length * edge.uncertainty, strict=True):
-            columns[f"{name}_edge_std"] = std
-        strain = unchecked_strain(elements, np.zeros((len(elements), 4, 4)), self.measure)
-        return columns | {entry.name: strain[entry.name.removesuffix("_element")].values for entry in ELEMENT_STRAIN}
+        columns |= zip(("u_edge_std", "v_edge_std"), self.length * np.asarray(edge), strict=True)
+        return columns | {f"{name}_element": in_elements[name].values for name in ("exx", "eyy", "exy")}
