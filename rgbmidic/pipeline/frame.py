@@ -203,7 +203,7 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
     windowed_state = state
-    if not isinstance(state, IlluminationImages):
+    if window != plan.window and not isinstance(state, IlluminationImages):
         windowed_state = tuple(replace(frame, values=frame.values[..., *reference_slices]) for frame in state)
     warnings = exposure_warnings(plan, windowed_state)
     with stage("separation"):
