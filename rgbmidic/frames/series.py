@@ -267,7 +267,9 @@ class FrameSeries:
         for light in range(max(self.n_lights, len(self.lights))):
             series, frame = (0, begin + light) if self.n_lights > 1 else (light, begin)
             position = bisect_right(self._ends[series], frame)
-            located.append((self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0)))
+            located.append(
+                (self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0))
+            )
         return located
 
 
