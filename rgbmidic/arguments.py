@@ -1,4 +1,4 @@
-"""Values in the types of annotations: of a settings file, of a function's arguments, of a class's fields.
+"""Values in the types of annotations and within bounds: of a settings file, a function's arguments, a class's fields.
 
 What cannot be converted without a loss is refused in one line.
 """
@@ -8,9 +8,10 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import MISSING, Field, field, fields, is_dataclass
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -187,6 +188,55 @@ def to_plain(value: Any) -> Any:
 def type_hints(settings: Any) -> dict[str, Any]:
     """Return the types of the fields of a class of settings, which take a while to resolve."""
     return get_type_hints(settings)
+
+
+def bounded(default: Any = MISSING, **bounds: float) -> Any:
+    """Return a field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
+
+    Parameters
+    ----------
+    default
+        Value where none is stated; none: the key is required.
+    **bounds
+        Bounds by their names.
+
+    Returns
+    -------
+    dataclasses.Field
+
+    Examples
+    --------
+    >>> from dataclasses import make_dataclass
+    >>> from rgbmidic.settings import read_section
+    >>> Gauge = make_dataclass("Gauge", [("length", float, bounded(10.0, above=0))], frozen=True, kw_only=True)
+    >>> read_section(Gauge, "gauge", {"length": 4}).length
+    4.0
+    >>> read_section(Gauge, "gauge", {"length": -4})
+    Traceback (most recent call last):
+    rgbmidic.errors.ConfigurationError: gauge.length must be above 0, not -4
+    """
+    return field(default=default, metadata={"bounds": bounds})
+
+
+_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
+
+
+def convert_field(entry: Field[Any], value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
+    """Return a value in the type of a field, every number of it finite and within the field's bounds."""
+    value = convert_value(value, hint, key, base)
+    for number in _numbers(value):
+        if not math.isfinite(number):
+            raise ConfigurationError(f"{key} must be finite, not {number}")
+        for bound, limit in entry.metadata.get("bounds", {}).items():
+            if not _BOUNDS[bound](number, limit):
+                raise ConfigurationError(f"{key} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+    return value
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, int | float) else []
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:

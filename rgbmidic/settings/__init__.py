@@ -1,9 +1,8 @@
 """Settings of a test, as TEST.toml states them: their schema, the conversion of its values, reading it."""
 
-from rgbmidic.arguments import convert_value, read_range, to_plain
+from rgbmidic.arguments import bounded, convert_value, read_range, to_plain
 from rgbmidic.renamed import refuse_old_names
 from rgbmidic.settings.conversion import (
-    bounded,
     check_names,
     read_section,
     read_table,

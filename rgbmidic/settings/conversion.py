@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import math
-import operator
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, Field, field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_args
 
-from rgbmidic.arguments import convert_fields, convert_value, type_hints
+from rgbmidic.arguments import convert_field, convert_fields, type_hints
 from rgbmidic.errors import ConfigurationError
 
 _Section = TypeVar("_Section")
@@ -139,54 +137,6 @@ def check_names(names: Iterable[str], allowed: Iterable[str], noun: str, locatio
             close = difflib.get_close_matches(name, allowed, n=1)
             hint = f' (did you mean "{close[0]}"?)' if close else ""
             raise ConfigurationError(f'unknown {noun} "{name}" in {location}{hint}; allowed are {", ".join(allowed)}')
-
-
-def bounded(default: Any = MISSING, **bounds: float) -> Any:
-    """Return a field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
-
-    Parameters
-    ----------
-    default
-        Value where none is stated; none: the key is required.
-    **bounds
-        Bounds by their names.
-
-    Returns
-    -------
-    dataclasses.Field
-
-    Examples
-    --------
-    >>> from dataclasses import make_dataclass
-    >>> Gauge = make_dataclass("Gauge", [("length", float, bounded(10.0, above=0))], frozen=True, kw_only=True)
-    >>> read_section(Gauge, "gauge", {"length": 4}).length
-    4.0
-    >>> read_section(Gauge, "gauge", {"length": -4})
-    Traceback (most recent call last):
-    rgbmidic.errors.ConfigurationError: gauge.length must be above 0, not -4
-    """
-    return field(default=default, metadata={"bounds": bounds})
-
-
-_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
-
-
-def convert_field(entry: Field[Any], value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
-    """Return a value in the type of a field, every number of it finite and within the field's bounds."""
-    value = convert_value(value, hint, key, base)
-    for number in _numbers(value):
-        if not math.isfinite(number):
-            raise ConfigurationError(f"{key} must be finite, not {number}")
-        for bound, limit in entry.metadata.get("bounds", {}).items():
-            if not _BOUNDS[bound](number, limit):
-                raise ConfigurationError(f"{key} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
-    return value
-
-
-def _numbers(value: Any) -> list[float]:
-    if isinstance(value, tuple):
-        return [number for entry in value for number in _numbers(entry)]
-    return [value] if isinstance(value, int | float) else []
 
 
 class CheckedSettings:

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rgbmidic.arguments import convert_value, to_plain, type_hints
+from rgbmidic.arguments import bounded, convert_value, to_plain, type_hints
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings.conversion import (
     CheckedSettings,
-    bounded,
     check_names,
     read_section,
     read_table,
