@@ -44,7 +44,7 @@ MOST_FILTERS = 16_384
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tiles:
-    """What decides on the filters of h x w tiles of a mosaic.
+    """The h x w tiles of a mosaic, by what decides on their filters.
 
     Attributes
     ----------
