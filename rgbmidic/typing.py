@@ -53,4 +53,12 @@ def as_numbers(
     return array
 
 
+def unmasked(array: npt.ArrayLike) -> AnyArray:
+    """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        values: Any = array if array.dtype.kind in "fc" else array.astype(np.float64)
+        return np.asarray(np.ma.filled(values, np.nan))
+    return np.asarray(array)
+
+
 __getattr__ = refuse_old_names(__name__)

@@ -25,7 +25,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import cfa_channels, colour_planes
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.histogram import saturation_pile, unevenness
+from rgbmidic.illumination.plane_samples import saturation_pile, unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

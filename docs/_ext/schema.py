@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from rgbmidic.settings.conversion import to_plain, type_hints
+from rgbmidic.arguments import to_plain, type_hints
 from rgbmidic.settings.schema import section_types
 
 _TYPES = {bool: "boolean", float: "number", int: "integer", str: "string", Path: "string"}

@@ -7,10 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
-from rgbmidic.arguments import unmasked
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, unmasked
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
 PREFILTERS: dict[str, FloatArray] = {

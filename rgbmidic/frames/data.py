@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
@@ -32,6 +32,8 @@ class Window:
         Its rows and columns.
     frame
         Rows and columns of the frame.
+    is_whole
+        True where it is all of the frame.
 
     Examples
     --------
@@ -43,6 +45,11 @@ class Window:
     origin: tuple[int, int]
     shape: tuple[int, int]
     frame: tuple[int, int]
+    is_whole: bool = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Compare the shapes."""
+        object.__setattr__(self, "is_whole", self.shape == self.frame)
 
     @classmethod
     def of_frame(cls, frame: tuple[int, int]) -> Window:
@@ -84,11 +91,6 @@ class Window:
         high = np.minimum((last // grid + 1) * grid, size)
         (first_column, first_row), (columns, rows) = low.tolist(), (high - low).tolist()
         return cls(origin=(first_column, first_row), shape=(rows, columns), frame=frame)
-
-    @property
-    def is_whole(self) -> bool:
-        """True where it is all of the frame."""
-        return self.shape == self.frame
 
     def slices_in(self, outer: Window) -> tuple[slice, slice]:
         """Return where it lies, rows and columns, in a window that holds all of it.

@@ -79,8 +79,12 @@ class FrameFormat:
         return self.recognises(path, user_metadata)
 
 
-def _is_tiff(path: Path) -> bool:
+def _is_tiff(path: Path, _: FrameSettings) -> bool:
     return path.suffix.lower() in TIFF_ENDINGS and not is_dng(path)
+
+
+def _is_tiff_stack(path: Path, _: FrameSettings) -> bool:
+    return path.suffix.lower() in TIFF_ENDINGS and is_tiff_stack(path) and not is_dng(path)
 
 
 FORMATS = (
@@ -93,10 +97,8 @@ FORMATS = (
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
     FrameFormat(name="PGM", endings=(".pgm",), source=PgmFile),
     FrameFormat(name="BMP", endings=(".bmp",), source=BmpFile),
-    FrameFormat(
-        name="TIFF stacks", recognises=lambda path, _: _is_tiff(path) and is_tiff_stack(path), source=TiffStack
-    ),
-    FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=lambda path, _: _is_tiff(path), source=TiffFile),
+    FrameFormat(name="TIFF stacks", recognises=_is_tiff_stack, source=TiffStack),
+    FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=_is_tiff, source=TiffFile),
     FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",

@@ -201,7 +201,7 @@ class FrameSeries:
         -------
         int or None
         """
-        source, inner = next(self._locate(index))
+        source, inner = self._locate(index)[0]
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
 
@@ -259,15 +259,18 @@ class FrameSeries:
             digest.update(f"{name}\0{content}\n".encode())
         return digest.hexdigest(), tuple(without)
 
-    def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
+    def _locate(self, index: int) -> list[tuple[FrameSource, int]]:
         """Return source, and frame in it, of every light of a state."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in a series of {len(self)}")
-        begin = self.first_frames[index]
+        begin, located = self.first_frames[index], []
         for light in range(max(self.n_lights, len(self.lights))):
             series, frame = (0, begin + light) if self.n_lights > 1 else (light, begin)
             position = bisect_right(self._ends[series], frame)
-            yield self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0)
+            located.append(
+                (self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0))
+            )
+        return located
 
 
 def open_series(

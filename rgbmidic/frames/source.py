@@ -18,6 +18,7 @@ from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
+_NOTHING_STATED = Recording()
 
 
 @state_new_names
@@ -67,7 +68,7 @@ class FrameSource(ABC):
     @property
     def recording(self) -> Recording:
         """Recording of the frames, from the header alone; a file of one frame states nothing and is not read."""
-        return Recording()
+        return _NOTHING_STATED
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -26,20 +26,19 @@ from rgbmidic.frames.metadata import (
     MovieHeader,
     StoredFrame,
     check_count,
-    check_size,
     damaged_file,
     unpack_bits,
 )
 from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
 from rgbmidic.frames.tiff_pages import (
+    PACKED_BITS,
     UNCOMPRESSED,
     PageList,
     Tag,
-    has_uncompressed_data,
-    missing_data,
+    check_page,
+    only_page,
     open_tiff,
     tag,
-    tiff_pages,
 )
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
@@ -52,8 +51,6 @@ TIFF_ENDINGS = (".tif", ".tiff")
 _DECOMPRESSORS: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
-_PACKED = (10, 12, 14)
-"""Bits of samples that are stored without a gap; they have a white level of their own."""
 _MISSING = -1
 """In place of the offset of a page that is announced, and that the list of pages does not lead to."""
 
@@ -72,11 +69,11 @@ class TiffFile(FrameSource):
             return ()
 
     def _shape(self) -> tuple[int, int]:
-        with _only_page(self.path) as page:
+        with only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
 
     def _rows(self, index: int, rows: slice) -> StoredFrame:
-        with _only_page(self.path) as page:
+        with only_page(self.path) as page:
             values = _stored_rows(page, self.path, range(page.imagelength)[rows])
             return _to_stored_frame(
                 _unpack_with_opencv(page, self.path)[rows] if values is None else values, page, self.path
@@ -113,37 +110,7 @@ def _to_stored_frame(values: AnyArray, page: tifffile.TiffPage, path: Path) -> S
     pattern = tag(page, Tag.CFA_PATTERN) or ()
     is_bayer = tag(page, Tag.CFA_REPEAT) == (2, 2) and set(pattern) <= {0, 1, 2}
     frame = StoredFrame.from_samples(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
-    return replace(frame, bits=page.bitspersample) if page.bitspersample in _PACKED else frame
-
-
-@contextmanager
-def _only_page(path: Path) -> Iterator[tifffile.TiffPage]:
-    with tiff_pages(path) as pages:
-        if not pages:
-            raise damaged_file(path, "its header leads to no image")
-        if len(pages) > 1:
-            raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
-        _check_page(pages[0], path)
-        yield pages[0]
-
-
-def _check_page(page: tifffile.TiffPage, path: Path) -> None:
-    """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
-    bits, integer = page.bitspersample, page.dtype is not None and page.dtype.kind == "u"
-    if not integer or bits not in ((8, 16, *_PACKED) if page.compression == UNCOMPRESSED else (8, 16)):
-        kind = page.dtype if bits in (8, 16, 32, 64) else f"{bits}-bit"
-        allowed = "unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"
-        raise FrameError(f"{path} has {kind or 'unknown'} samples; allowed are {allowed}")
-    if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
-        size_text = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
-        raise damaged_file(path, f"its header announces {size_text}")
-    size = path.stat().st_size
-    if reason := missing_data(page, size):
-        raise damaged_file(path, reason)
-    n_stored = sum(page.databytecounts)
-    if page.compression == UNCOMPRESSED and not has_uncompressed_data(page):
-        raise damaged_file(path, f"its header announces {n_stored} bytes of image data, too few for its size")
-    check_size(path, unpacked=page.nbytes, stored=min(n_stored, size))
+    return replace(frame, bits=page.bitspersample) if page.bitspersample in PACKED_BITS else frame
 
 
 def _unpack(page: tifffile.TiffPage, path: Path) -> AnyArray:
@@ -151,7 +118,7 @@ def _unpack(page: tifffile.TiffPage, path: Path) -> AnyArray:
     if page.compression not in (UNCOMPRESSED, *_DECOMPRESSORS):
         name = getattr(page.compression, "name", page.compression)
         raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
-    if page.bitspersample in _PACKED:
+    if page.bitspersample in PACKED_BITS:
         return _unpack_bits(page, path)
     if page.compression in _DECOMPRESSORS:
         _check_unpacked(page, path)
@@ -237,7 +204,7 @@ class _Pages(MovieHeader):
         if not is_contiguous and (index >= len(self.offsets) or self.offsets[index] == _MISSING):
             raise FrameError(f"{path}: its list of frames ends after {readable - 1}: truncated or still being written")
         with _page_at(path, int(self.offsets[0 if is_contiguous else index])) as page:
-            _check_page(page, path)
+            check_page(page, path)
             if (page.imagelength, page.imagewidth) != self.shape:
                 size_text = f"{page.imagelength} rows of {page.imagewidth} pixels"
                 raise FrameError(f"{path}: frame {index} has {size_text}, the first {self.shape[0]} of {self.shape[1]}")

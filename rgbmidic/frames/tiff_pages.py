@@ -17,10 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.metadata import (
-    damaged_file,
-    library_faults,
-)
+from rgbmidic.frames.metadata import check_size, damaged_file, library_faults
 from rgbmidic.settings import require_regular_file
 
 if TYPE_CHECKING:
@@ -36,6 +33,8 @@ _FIRST_OFFSET = 8
 """Bytes of the header of a TIFF file, the shortest."""
 UNCOMPRESSED = 1
 """Code of the compression of samples that are not compressed."""
+PACKED_BITS = (10, 12, 14)
+"""Bits of samples that are stored without a gap; they have a white level of their own."""
 
 
 class Tag(IntEnum):
@@ -97,7 +96,7 @@ def open_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
     """Open a TIFF file; what is done inside and fails over a damaged header becomes a FrameError."""
     import tifffile
 
-    with require_regular_file(path).open("rb") as file:
+    with path.open("rb") as file:  # which `FrameSource` and `TiffStack` have found to be a regular one
         PageList(file, path)  # tifffile tries some camera raws that begin as a TIFF file does
     with library_faults(path, OSError), tifffile.TiffFile(path) as tiff:
         yield tiff
@@ -255,6 +254,37 @@ def has_uncompressed_data(page: tifffile.TiffPage) -> bool:
     bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
     n_bytes = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
     return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= n_bytes)
+
+
+@contextmanager
+def only_page(path: Path) -> Iterator[tifffile.TiffPage]:
+    """Open the image of a TIFF file of one, and check it."""
+    with tiff_pages(path) as pages:
+        if not pages:
+            raise damaged_file(path, "its header leads to no image")
+        if len(pages) > 1:
+            raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
+        check_page(pages[0], path)
+        yield pages[0]
+
+
+def check_page(page: tifffile.TiffPage, path: Path) -> None:
+    """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
+    bits, integer = page.bitspersample, page.dtype is not None and page.dtype.kind == "u"
+    if not integer or bits not in ((8, 16, *PACKED_BITS) if page.compression == UNCOMPRESSED else (8, 16)):
+        kind = page.dtype if bits in (8, 16, 32, 64) else f"{bits}-bit"
+        allowed = "unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"
+        raise FrameError(f"{path} has {kind or 'unknown'} samples; allowed are {allowed}")
+    if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
+        size_text = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
+        raise damaged_file(path, f"its header announces {size_text}")
+    size = path.stat().st_size
+    if reason := missing_data(page, size):
+        raise damaged_file(path, reason)
+    n_stored = sum(page.databytecounts)
+    if page.compression == UNCOMPRESSED and not has_uncompressed_data(page):
+        raise damaged_file(path, f"its header announces {n_stored} bytes of image data, too few for its size")
+    check_size(path, unpacked=page.nbytes, stored=min(n_stored, size))
 
 
 def tag(page: tifffile.TiffPage, code: int) -> tuple[Any, ...] | None:

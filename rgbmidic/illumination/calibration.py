@@ -67,7 +67,7 @@ class Calibration:
     name
         Name in messages: the file name.
     unevenness
-        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.histogram.unevenness`).
+        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.plane_samples.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; not changed by reading.
     extra

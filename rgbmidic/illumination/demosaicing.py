@@ -10,7 +10,7 @@ is kept, the coarse lattices of red and blue are filled from what the others see
 have nothing in common, is reconstructed channel by channel.
 
 The contrast at a site of kind s is ``sum_l A_sl alpha_l (a(y - d_l) + e_l)`` and camera noise
-(`rgbmidic.illumination.mosaic_model`): common texture a of autocorrelation C, shown displaced by the lens, and
+(`rgbmidic.illumination.colour_factors`): common texture a of autocorrelation C, shown displaced by the lens, and
 light-specific components e_l. The best linear prediction of a channel at a pixel from the N x N samples around it has
 the filter ``(K + V)^-1 k``, with K the covariance of the samples, V their noise and k their covariance with what is
 wanted (`rgbmidic.illumination.prediction_filters`). What one light sparkles all channels see by their crosstalk, so
@@ -31,9 +31,12 @@ from rgbmidic._kernels.illumination import PAD, malvar
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.colour_factors import (
+    BLOCK,
     MEAN_BLOCK,
     ColourFactors,
     Moments,
+    MosaicModel,
+    channel_means,
     colour_factors,
     gather_moments,
     learn_texture,
@@ -46,8 +49,7 @@ from rgbmidic.illumination.crosstalk import Crosstalk, required_channels
 from rgbmidic.illumination.displacement import LightDisplacement, light_displacement
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
-from rgbmidic.illumination.mosaic_model import BLOCK, MosaicModel, channel_means
-from rgbmidic.illumination.prediction_filters import FilterTables, prediction_filters
+from rgbmidic.illumination.prediction_filters import FilterTables, Tiles
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -265,17 +267,15 @@ class _Frame:
         tables: FilterTables | None = None,
         left_out: bool = False,
     ) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
-        return prediction_filters(
-            _per_tile(specific),
-            _per_tile(self.factors.noise),
-            texture,
-            self.mosaic.cfa,
-            light_fraction=self.factors.light_fraction,
+        """Return the filters for the tiles of lights of a `specific` variance (`FilterTables.find`)."""
+        tiles = Tiles(
+            specific=_per_tile(specific),
+            noise=_per_tile(self.factors.noise),
             displacement=_per_tile(self.model.displacement),
             glints=self.glints,
-            tables=tables,
-            left_out=left_out,
         )
+        tables, fraction = tables or FilterTables(), self.factors.light_fraction
+        return tables.find(tiles, texture, self.mosaic.cfa, fraction, left_out=left_out)
 
     def _contrast(self, tiles: int, size: int) -> FloatImage:
         """Return the samples' contrast over its spread, padded for filters of a side; NaN where saturated."""

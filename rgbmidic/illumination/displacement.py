@@ -18,9 +18,8 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
-from rgbmidic.illumination.colour_factors import ColourFactors, Moments, upsample_rows
+from rgbmidic.illumination.colour_factors import BLOCK, FAINTEST, ColourFactors, Moments, MosaicModel, upsample_rows
 from rgbmidic.illumination.images import frame_geometry, registration_basis
-from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST, MosaicModel
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

@@ -19,8 +19,7 @@ from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, refused, reported, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.histogram import SIGNIFICANCE, unevenness
-from rgbmidic.illumination.plane_samples import Frame, PlaneSamples
+from rgbmidic.illumination.plane_samples import SIGNIFICANCE, Frame, PlaneSamples, unevenness
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 

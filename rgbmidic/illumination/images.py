@@ -383,8 +383,7 @@ class IlluminationImages:
             0 where a light's contrast is that of the light with the most contrast there, towards 1 in its reflection;
             None where the separation does not give it.
         """
-        from rgbmidic.illumination.colour_factors import upsample  # reading a result takes no kernels
-        from rgbmidic.illumination.mosaic_model import BLOCK
+        from rgbmidic.illumination.colour_factors import BLOCK, upsample  # reading a result takes no kernels
 
         if self.reflection is None:
             return None

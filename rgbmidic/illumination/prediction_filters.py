@@ -7,14 +7,14 @@ and the noise; all are rounded, so that the tiles of a frame, and the frames of 
 from __future__ import annotations
 
 import threading
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.demosaicing import prediction_taps
 from rgbmidic.frames.data import cfa_channels
-from rgbmidic.illumination.mosaic_model import CHANNEL, channel_means
+from rgbmidic.illumination.colour_factors import CHANNEL, channel_means
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -42,6 +42,46 @@ MOST_FILTERS = 16_384
 """Filters that a table keeps (20 MB): those of 16 frames of a megapixel that share none."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tiles:
+    """The h x w tiles of a mosaic, by what decides on their filters.
+
+    Attributes
+    ----------
+    specific : ndarray, shape (k, h, w)
+        Light-specific variance, relative to the common one.
+    noise : ndarray, shape (3, h, w)
+        Variance of the camera noise of each channel, relative to the common texture's in it.
+    displacement : ndarray, shape (k, 2, h, w)
+        Place (x, y) at which each light shows the texture, px, by the lens.
+    glints : ndarray, shape (k, 2, h, w)
+        The same by what it reflects: added, and the lights are as much less alike.
+    """
+
+    specific: FloatArray
+    noise: FloatArray
+    displacement: FloatArray
+    glints: FloatArray
+
+    def codes(self) -> npt.NDArray[np.int16]:
+        """Round them, (h w, n): tiles of one code share their filters."""
+        level = np.log2(np.clip(self.specific, 2.0**SMALLEST, 2.0**LARGEST))
+        half_octave = 2 * np.log2(np.maximum(self.noise, LEAST_NOISE))
+        shape = -1, *self.specific.shape[1:]
+        steps = [(field / STEP).reshape(shape) for field in (self.displacement + self.glints, self.glints)]
+        codes = np.concatenate([level, half_octave, *steps])
+        return np.ascontiguousarray(np.round(codes.reshape(len(codes), -1).T), dtype=np.int16)
+
+
+@dataclass(slots=True)
+class _Table:
+    """The filters (M, 2, 3, size², 2) of one texture, by code, and the covariances that they are made of."""
+
+    covariances: tuple[FloatArray, float, FloatArray]
+    rows: dict[bytes, int]
+    taps: FloatImage
+
+
 class FilterTables:
     """Filters that were needed so far, by texture, pattern and what the sites see; kept as long as a test runs.
 
@@ -49,7 +89,7 @@ class FilterTables:
     """
 
     def __init__(self) -> None:
-        self._tables: dict[tuple[object, ...], tuple[dict[bytes, int], FloatImage]] = {}
+        self._tables: dict[tuple[object, ...], _Table] = {}
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type[FilterTables], tuple[()]]:
@@ -57,97 +97,70 @@ class FilterTables:
         return FilterTables, ()
 
     def find(
-        self,
-        codes: npt.NDArray[np.int16],
-        texture: TextureModel,
-        cfa: str,
-        light_fraction: FloatArray,
-        *,
-        left_out: bool,
+        self, tiles: Tiles, texture: TextureModel, cfa: str, light_fraction: FloatArray, *, left_out: bool = False
     ) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
-        """Return the row of the table for each of T codes, the table (M, 2, 3, size², 2), and the square's side."""
+        """Return the filters for tiles.
+
+        Parameters
+        ----------
+        tiles
+            Of a mosaic.
+        texture
+            Autocorrelation of the common texture, and of the light-specific component.
+        cfa
+            Bayer pattern.
+        light_fraction : ndarray, shape (4, k)
+            Fraction of each light in the slope of each site's channel (`MosaicModel.light_fraction`).
+        left_out
+            Whether the sample at the pixel itself is left out.
+
+        Returns
+        -------
+        index : ndarray, shape (h, w), int32
+            Row of the table for each tile.
+        taps : ndarray, shape (T, 2, 3, size², 2), float32
+            As `rgbmidic._kernels.demosaicing.predict` takes them, with one output for each channel.
+        size : int
+            Side of the square of samples.
+        """
+        codes = tiles.codes()
         # a colour left to itself has only every other sample, so it needs to look farther
         size = SIZE if texture.specific < 0.5 else WIDE
         keys, first, index = np.unique(
             codes.view([("", codes.dtype)] * codes.shape[1]).ravel(), return_index=True, return_inverse=True
         )
         names = [key.tobytes() for key in keys]
-        table = texture, cfa, light_fraction.tobytes(), left_out
+        key = texture, cfa, light_fraction.tobytes(), left_out
         with self._lock:
-            rows, taps = self._tables.get(table, ({}, np.empty((0, 2, 3, size * size, 2), dtype=np.float32)))
-            missing = [n for n, name in enumerate(names) if name not in rows]
-            if len(rows) + len(missing) > MOST_FILTERS:
-                rows, taps, missing = {}, taps[:0], list(range(len(names)))
+            table = self._tables.get(key) or _Table(_covariances(texture, size), {}, _no_taps(size))
+            missing = [n for n, name in enumerate(names) if name not in table.rows]
+            if len(table.rows) + len(missing) > MOST_FILTERS:
+                table, missing = _Table(table.covariances, {}, _no_taps(size)), list(range(len(names)))
             if missing:
-                new_taps = _filters(
-                    codes[first[missing]], texture, cfa, light_fraction, size, LEFT_OUT if left_out else 0.0
-                )
-                rows = rows | {names[n]: len(taps) + position for position, n in enumerate(missing)}
-                taps = np.concatenate([taps, new_taps])
-                if len(self._tables) >= 4 and table not in self._tables:
+                if len(self._tables) >= 4 and key not in self._tables:
                     self._tables.clear()
-                self._tables[table] = rows, taps
-        return np.array([rows[name] for name in names], dtype=np.int32)[index.ravel()], taps, size
+                held = LEFT_OUT if left_out else 0.0
+                taps = _filters(codes[first[missing]], texture, cfa, light_fraction, held, table.covariances)
+                rows = table.rows | {names[n]: len(table.taps) + position for position, n in enumerate(missing)}
+                table = self._tables[key] = _Table(table.covariances, rows, np.concatenate([table.taps, taps]))
+        found = np.array([table.rows[name] for name in names], dtype=np.int32)[index.ravel()]
+        return found.reshape(tiles.specific.shape[1:]), table.taps, size
 
 
-def prediction_filters(
-    specific: FloatArray,
-    noise: FloatArray,
-    texture: TextureModel,
-    cfa: str,
-    *,
-    light_fraction: FloatArray,
-    displacement: FloatArray,
-    glints: FloatArray,
-    tables: FilterTables | None = None,
-    left_out: bool = False,
-) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
-    """Return the filters for tiles whose lights have some variance of their own.
-
-    Parameters
-    ----------
-    specific : (k, h, w)
-        Light-specific variance in each tile, relative to the common one.
-    noise : (3, h, w)
-        Variance of the camera noise of each channel, relative to the common texture's in it.
-    texture
-        Autocorrelation of the common texture, and of the light-specific component.
-    cfa
-        Bayer pattern.
-    light_fraction : (4, k)
-        Fraction of each light in the slope of each site's channel (`MosaicModel.light_fraction`).
-    displacement : (k, 2, h, w)
-        Place (x, y) at which each light shows the texture, px, by the lens.
-    glints : (k, 2, h, w)
-        The same by what it reflects: added, and the lights are as much less alike.
-    tables
-        Where filters are kept; None: they are not.
-    left_out
-        Whether the sample at the pixel itself is left out.
-
-    Returns
-    -------
-    index : (h, w) int32
-        Row of the table for each tile.
-    taps : (T, 2, 3, size², 2) float32
-        As `rgbmidic._kernels.demosaicing.predict` takes them, with one output for each channel.
-    size : int
-        Side of the square of samples.
-    """
-    tiles = specific.shape[1:]
-    level = np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))
-    half_octave = 2 * np.log2(np.maximum(noise, LEAST_NOISE))
-    steps = [(field / STEP).reshape(-1, *tiles) for field in (displacement + glints, glints)]
-    codes = np.concatenate([level, half_octave, *steps]).reshape(-1, tiles[0] * tiles[1]).T
-    rounded = np.ascontiguousarray(np.round(codes), dtype=np.int16)
-    index, taps, size = (tables or FilterTables()).find(rounded, texture, cfa, light_fraction, left_out=left_out)
-    return index.reshape(tiles), taps, size
+def _no_taps(size: int) -> FloatImage:
+    return np.empty((0, 2, 3, size * size, 2), dtype=np.float32)
 
 
 def _filters(
-    codes: npt.NDArray[np.int16], texture: TextureModel, cfa: str, light_fraction: FloatArray, size: int, held: float
+    codes: npt.NDArray[np.int16],
+    texture: TextureModel,
+    cfa: str,
+    light_fraction: FloatArray,
+    held: float,
+    covariances: tuple[FloatArray, float, FloatArray],
 ) -> FloatImage:
-    """Make the filters (T, 2, 3, size², 2) of T codes."""
+    """Make the filters (T, 2, 3, size², 2) of T codes; `held` is the variance of the noise at the pixel itself."""
+    size = len(covariances[2]) // 2 + 1
     lights = light_fraction.shape[1]
     level, half_octave, position, glint = np.split(codes.astype(np.float64), np.cumsum([lights, 3, 2 * lights]), axis=1)
     variance = np.exp2(level)
@@ -165,7 +178,7 @@ def _filters(
         np.ascontiguousarray(STEP * position).reshape(-1, lights, 2),
         np.exp2(half_octave / 2) / spread**2,
         held,
-        *_covariances(texture, size),
+        *covariances,
         OFFSET_VARIANCE,
         np.stack([cell[np.ix_((offset + p) % 2, (offset + q) % 2)] for p, q in phases]),
         taps,
@@ -181,7 +194,6 @@ def _site_kinds(cfa: str) -> npt.NDArray[np.int64]:
     return np.where(channels == 1, np.where(red_row, 1, 2), channels + (channels == 2)).astype(np.int64)
 
 
-@lru_cache(maxsize=8)
 def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, float, FloatArray]:
     """Return the texture's autocorrelation, a step of squared distance (px²) apart, and a light's own component's.
 

@@ -155,7 +155,6 @@ def _line(widths: tuple[float, ...], p: int, q: int, distance: npt.ArrayLike = 0
     return np.asarray(_BINOMIAL[p::2] @ gaussians @ _BINOMIAL[q::2])
 
 
-@lru_cache(maxsize=64)
 def _band_energies(widths: tuple[float, ...]) -> FloatArray:
     """Return the moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
     same, opposite = (_line(widths, 0, 0) + _line(widths, 1, 1)) / 2, _line(widths, 0, 1)
@@ -269,7 +268,9 @@ def fit_texture(products: LagProducts, agreement: float) -> TextureModel:
         coarse = WIDTHS[WIDTHS > 1]
         r = np.broadcast_to(distance[:, None], met.shape)[met]
         gaussians, product = np.exp(-0.5 * (r[:, None] / coarse) ** 2), sums[:, :3][met] / counts[:, :3][met]
-        return _mixture(gaussians, product, 1 / (1 + r), best, widths=coarse, specific=1.0)
+        importance = 1 / (1 + r)
+        system = np.column_stack([gaussians, -np.ones(product.size)]) * importance[:, None]
+        return _mixture(system, product * importance, coarse, correlation=best, specific=1.0)
     energies = _band_energies(tuple(WIDTHS.tolist()))
     rows = []
     for pair, kind in enumerate((1, 2, 1)):
@@ -286,7 +287,14 @@ def fit_texture(products: LagProducts, agreement: float) -> TextureModel:
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
-    model = _mixture(gaussians, product, importance, best, band=(unit, fine))
+    system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
+    sum_to_one = np.append(np.ones(len(WIDTHS)), -1.0)
+    # short distances hardly distinguish a constant from a wide Gaussian: an offset of 1 costs an error (of products) of
+    # .05; the true one is -0.02 to -0.15
+    small_offset = np.append(np.zeros(len(WIDTHS)), 0.05)
+    system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
+    target = np.concatenate([np.zeros(product.size), [1e3, 0.0, 0.0]])
+    model = _mixture(system, target, WIDTHS, correlation=best)
     return replace(model, specific=_coarse_fraction(model, sums, counts, overall))
 
 
@@ -304,32 +312,12 @@ def _gaussians(products: LagProducts, pair: int) -> FloatArray:
 
 
 def _mixture(
-    gaussians: FloatArray,
-    product: FloatArray,
-    importance: FloatArray,
-    correlation: float,
-    *,
-    widths: FloatArray = WIDTHS,
-    band: tuple[FloatArray, FloatArray] | None = None,
-    specific: float = 0.0,
+    system: FloatArray, target: FloatArray, widths: FloatArray, *, correlation: float, specific: float = 0.0
 ) -> TextureModel:
-    """Fit weights w >= 0 and offset c <= 0 of a texture by least squares, rows weighted by their importance.
+    """Fit weights w >= 0 and offset c <= 0 of a texture by least squares: ``system @ (w, -c) = target``.
 
-    ``sum w g + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
-    ``sum w (g - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
+    The first is up to a factor where the system does not say that ``sum w + c = 1``.
     """
-    if band is None:
-        system = np.column_stack([gaussians, -np.ones(product.size)]) * importance[:, None]
-        target = product * importance
-    else:
-        unit, fine = band
-        system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
-        sum_to_one = np.append(np.ones(len(widths)), -1.0)
-        # short distances hardly distinguish a constant from a wide Gaussian: an offset of 1 costs an error (of
-        # products) of .05; the true one is -0.02 to -0.15
-        small_offset = np.append(np.zeros(len(widths)), 0.05)
-        system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
-        target = np.concatenate([np.zeros(product.size), [1e3, 0.0, 0.0]])
     from scipy.optimize import nnls  # half a second to import
 
     solution = nnls(system, target)[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -40,6 +40,8 @@ class PixelMap:
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     lines : ndarray, shape (R, 4), int32
         First slot, number of pixels, row and column in `bounds` of every run.
+    positions : tuple
+        Local x and y, offsets and shape functions: where the owned pixels lie, for kernels.
 
     Examples
     --------
@@ -60,6 +62,11 @@ class PixelMap:
     run_offsets: npt.NDArray[np.int64]
     bounds: tuple[int, int, int, int]
     lines: npt.NDArray[np.int32]
+    positions: tuple[FloatImage, FloatImage, npt.NDArray[np.int64], FloatArray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Hold what kernels take together."""
+        object.__setattr__(self, "positions", (self.local_x, self.local_y, self.offsets, self.barycentric))
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -115,11 +122,6 @@ class PixelMap:
             bounds=(first_row, first_column, *size),
             lines=np.stack([first, length, row - first_row, column - first_column], axis=1).astype(np.int32),
         )
-
-    @property
-    def positions(self) -> tuple[FloatImage, FloatImage, npt.NDArray[np.int64], FloatArray]:
-        """Local x and y, offsets and shape functions: where the owned pixels lie, for kernels."""
-        return self.local_x, self.local_y, self.offsets, self.barycentric
 
     @property
     def rows(self) -> npt.NDArray[np.int64]:

@@ -135,10 +135,12 @@ class Tri3Mesh(Derivable):
             nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
         return cls(nodes=nodes, elements=elements)
 
-    @property
+    @cached_property
     def centres(self) -> FloatArray:
         """Centre of each element, shape (E, 2), px."""
-        return np.asarray(self.nodes[self.elements].mean(axis=1))
+        centres = np.asarray(self.nodes[self.elements].mean(axis=1))
+        centres.setflags(write=False)
+        return centres
 
     @cached_property
     def centre_tree(self) -> cKDTree:

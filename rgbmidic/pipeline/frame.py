@@ -203,7 +203,7 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
     windowed_state = state
-    if not isinstance(state, IlluminationImages):
+    if window != plan.window and not isinstance(state, IlluminationImages):
         windowed_state = tuple(replace(frame, values=frame.values[..., *reference_slices]) for frame in state)
     warnings = exposure_warnings(plan, windowed_state)
     with stage("separation"):
@@ -212,11 +212,11 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
         grey_levels, weights = plan.prepared(images, index)
-        deformed = Deformed.prepare(grey_levels, weights, prefilter=plan.solver.prefilter, origin=window.origin)
+        deformed = Deformed.prepare(grey_levels, weights, prefilter=settings.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // 256)  # of the pictures of weights and reflections, 256 px at most
         thumbnail = _to_uint8(weights[:, *reference_slices][:, ::step, ::step])
         del grey_levels, weights  # a tenth of what a frame needs
-    solution = reference_update.track(deformed, start, plan.solver, plan.method)
+    solution = reference_update.track(deformed, start, settings.solver, plan.method)
     if solution.status is not Status.CONVERGED:
         causes = [solution.reason, *_causes(plan, windowed_state, images, reference.offset(deformed), solution)]
         if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
@@ -229,7 +229,7 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
         with stage("conclusion"):
             tracked = solution
             if settings.mesh.error is True or (settings.mesh.error == "key" and key):
-                solution = discretisation_error(reference, deformed, tracked, plan.solver, plan.method)
+                solution = discretisation_error(reference, deformed, tracked, settings.solver, plan.method)
             else:
                 solution = with_one_sided_error(reference.mesh, tracked)
             if unresolved := unresolved_strain(reference.mesh, tracked, solution):

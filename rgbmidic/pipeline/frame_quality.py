@@ -15,12 +15,12 @@ from scipy.ndimage import label, maximum, maximum_position
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.checks import Check
+from rgbmidic.illumination.colour_factors import BLOCK
 from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.displacement import LightDisplacement
-from rgbmidic.illumination.histogram import saturation_pile
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK
+from rgbmidic.illumination.plane_samples import saturation_pile
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh

@@ -96,6 +96,8 @@ class Plan:
         What is measured.
     weights
         How much each light counts.
+    method
+        What weighs the lights by their residuals; None: they are weighted by `weights` only.
     images
         Images of the reference state, in grey levels.
     reference
@@ -140,6 +142,7 @@ class Plan:
     separation: LightSeparation
     region: Region
     weights: LightWeights
+    method: PrecisionMethod | None
     images: IlluminationImages
     reference: Reference
     speckle: float | None
@@ -243,6 +246,7 @@ class Plan:
             separation=separate,
             region=region,
             weights=weights,
+            method=precision_method(weights, settings.weights.method),
             images=images,
             reference=_reference(images, weights, region, mesh, settings.solver),
             speckle=frame_quality.speckle_size(images, region),
@@ -258,16 +262,6 @@ class Plan:
         _check_reference(plan, state, calibration.noise if calibration else None)
         return plan
 
-    @property
-    def solver(self) -> SolverSettings:
-        """Settings of the solve."""
-        return self.settings.solver
-
-    @property
-    def method(self) -> PrecisionMethod | None:
-        """Return the method that weighs the lights by their residuals; None: they are weighted by `weights` only."""
-        return precision_method(self.weights, self.settings.weights.method)
-
     def on_mesh(self, mesh: Tri3Mesh) -> Plan:
         """The same test on another mesh of its region, in px of the window.
 
@@ -280,7 +274,7 @@ class Plan:
         -------
         Plan
         """
-        reference = _reference(self.images, self.weights, self.region, mesh, self.solver)
+        reference = _reference(self.images, self.weights, self.region, mesh, self.settings.solver)
         return replace(self, reference=reference)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:

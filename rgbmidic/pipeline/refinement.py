@@ -50,7 +50,7 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
     while len(counts) <= CONSTANTS.passes:
         mesh = plan.reference.mesh
         solution = solved(plan, key.deformed, key.start(mesh))
-        estimated = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
+        estimated = discretisation_error(plan.reference, key.deformed, solution, plan.settings.solver, plan.method)
         missed, noise = (  # the squares at the corners of each element; NaN takes no part
             np.nan_to_num(values[mesh.elements] ** 2).sum(axis=(1, 2))
             for values in (estimated.strain_error, estimated.strain_std)

@@ -150,7 +150,7 @@ def rms(values: FloatArray) -> float:
 
 def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
     """Solution of a frame from an initial guess (N, 2), or from a search."""
-    return track(plan.reference, deformed, TrackingState(displacement=start), plan.solver, plan.method)
+    return track(plan.reference, deformed, TrackingState(displacement=start), plan.settings.solver, plan.method)
 
 
 def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -350,7 +350,7 @@ class KeyFrame:
         if solution.status is Status.FAILED:
             raise FrameError(solution.reason)
         still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in static_frames]
-        estimated = discretisation_error(plan.reference, self.deformed, solution, plan.solver, plan.method)
+        estimated = discretisation_error(plan.reference, self.deformed, solution, plan.settings.solver, plan.method)
         comparable = [item for item in finer if CONSTANTS.finer * item[0].size <= mesh.size]
         # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
         # reflections, which every size averages in its own way, hardly differ from the next
@@ -387,7 +387,9 @@ class KeyFrame:
 def _deformed(plan: Plan, index: int) -> Deformed:
     """The images of a frame, ready to be interpolated."""
     window = plan.window_of()
-    return Deformed.prepare(*prepared_frame(plan, index, window), prefilter=plan.solver.prefilter, origin=window.origin)
+    return Deformed.prepare(
+        *prepared_frame(plan, index, window), prefilter=plan.settings.solver.prefilter, origin=window.origin
+    )
 
 
 def _resized(plan: Plan, size: float) -> Plan:

@@ -354,7 +354,7 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
         notes={
             **getattr(plan.weights, "notes", {}),
             **plan.notes,
-            "grey_levels": {"brightness": plan.solver.brightness, "gain_window": plan.reference.gain_window},
+            "grey_levels": {"brightness": plan.settings.solver.brightness, "gain_window": plan.reference.gain_window},
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.n_lost,

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.arguments import unmasked
 from rgbmidic.correlation import (
     Deformed,
     Reference,
@@ -42,7 +41,7 @@ from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.user_objects import check_object, check_type
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, unmasked
 from rgbmidic.weights import LightWeights, MaskWeights, Statistics, as_weights
 
 logger = logging.getLogger(__name__)

@@ -17,7 +17,6 @@ from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 
-from rgbmidic.arguments import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame
@@ -26,6 +25,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.user_objects import class_name, describe
 from rgbmidic.settings import FrameSettings, TestSettings
+from rgbmidic.typing import unmasked
 
 logger = logging.getLogger(__name__)
 

@@ -1,16 +1,13 @@
 """Settings of a test, as TEST.toml states them: their schema, the conversion of its values, reading it."""
 
+from rgbmidic.arguments import bounded, convert_value, read_range, to_plain
 from rgbmidic.renamed import refuse_old_names
 from rgbmidic.settings.conversion import (
-    bounded,
     check_names,
-    convert_value,
-    read_range,
     read_section,
     read_table,
     read_toml,
     require_regular_file,
-    to_plain,
     unique_keys,
 )
 from rgbmidic.settings.schema import (

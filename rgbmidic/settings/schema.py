@@ -14,17 +14,14 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from rgbmidic.arguments import bounded, convert_value, to_plain, type_hints
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings.conversion import (
     CheckedSettings,
-    bounded,
     check_names,
-    convert_value,
     read_section,
     read_table,
     read_toml,
-    to_plain,
-    type_hints,
 )
 from rgbmidic.settings.sections import (
     CalibrationSettings,

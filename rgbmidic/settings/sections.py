@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
-from rgbmidic.settings.conversion import CheckedSettings, bounded
+from rgbmidic.arguments import bounded
+from rgbmidic.settings.conversion import CheckedSettings
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 

@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.weights import best_mean, robust_weights
-from rgbmidic.arguments import unmasked
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.extensions import LIGHT_WEIGHTS, load_extension
 from rgbmidic.frames import read_mask
@@ -28,7 +27,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh.window import WINDOW, SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import TestSettings
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import FloatImage, unmasked
 from rgbmidic.weights.precision import Precision
 from rgbmidic.weights.threshold import ThresholdWeights
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.arguments import to_plain
 from rgbmidic.errors import InputError
 from rgbmidic.pipeline.resolution import rms
-from rgbmidic.settings.conversion import to_plain
 from rgbmidic.tools.lab import format_number, schema_document, write_findings
 from rgbmidic.tools.lab.planning import LampPlan, Outlook
 from rgbmidic.tools.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal

@@ -14,13 +14,12 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.arguments import checked
+from rgbmidic.arguments import bounded, checked
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.settings.conversion import bounded
 from rgbmidic.tools.scene import SceneSection
 from rgbmidic.tools.scene.spectra import Led, Sensitivities, spectral_response
 from rgbmidic.typing import FloatArray

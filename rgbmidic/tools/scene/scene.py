@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rgbmidic._kernels import render as kernels
-from rgbmidic.arguments import check_fields
+from rgbmidic.arguments import bounded, check_fields
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.settings import (
     ELEMENT_SIZE,
@@ -24,7 +24,6 @@ from rgbmidic.settings import (
     read_toml,
     require_regular_file,
 )
-from rgbmidic.settings.conversion import bounded
 from rgbmidic.tools.scene import SceneSection
 from rgbmidic.tools.scene.camera import (
     PIXEL,

@@ -15,9 +15,8 @@ from scipy.special import pdtr
 
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
-from rgbmidic.arguments import check_fields, checked
+from rgbmidic.arguments import bounded, check_fields, checked
 from rgbmidic.errors import InputError
-from rgbmidic.settings.conversion import bounded
 from rgbmidic.tools.scene import SceneSection
 from rgbmidic.typing import FloatArray
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rgbmidic.arguments import bounded
 from rgbmidic.errors import InputError
-from rgbmidic.settings.conversion import bounded
 from rgbmidic.tools.scene import SceneSection
 from rgbmidic.tools.scene.camera import NOMINAL_DISTANCE, Light
 from rgbmidic.tools.scene.scene import Cylinder, Plate, Scene, Sphere, State

@@ -17,8 +17,8 @@ from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import check_state, contradictions
-from rgbmidic.illumination.histogram import unevenness
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
+from rgbmidic.illumination.plane_samples import unevenness
 from rgbmidic.pipeline import measure
 
 BLACK, WHITE, SHAPE = 64, 4095, (288, 288)

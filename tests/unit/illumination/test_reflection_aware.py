@@ -9,18 +9,24 @@ from naive_demosaic import site_channels
 from scipy.ndimage import gaussian_filter, shift
 
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
+from rgbmidic.illumination.colour_factors import (
+    CHANNEL,
+    MosaicModel,
+    channel_means,
+    colour_factors,
+    gather_moments,
+    learn_texture,
+)
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import malvar_demosaic, reconstruct
 from rgbmidic.illumination.images import Registration, frame_geometry
-from rgbmidic.illumination.mosaic_model import CHANNEL, MosaicModel, channel_means
 from rgbmidic.illumination.prediction_filters import (
     DISSIMILAR,
     OFFSET_VARIANCE,
     SPARKLE_VARIANCE,
     WIDE,
     FilterTables,
-    prediction_filters,
+    Tiles,
 )
 from rgbmidic.illumination.separation import demosaic, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
@@ -139,18 +145,21 @@ def test_camera_noise_is_not_taken_for_a_reflection(mat):
 
 
 NOISE = np.full((3, 1, 1), 1e-4)
-STILL = {
-    "light_fraction": np.eye(3)[list(CHANNEL)],
-    "displacement": np.zeros((3, 2, 1, 1)),
-    "glints": np.zeros((3, 2, 1, 1)),
-}
-"""Each channel sees a light of its own, which is not displaced."""
+OWN_LIGHT = np.eye(3)[list(CHANNEL)]
+"""Each channel sees a light of its own."""
+
+
+def filters_at_rest(specific, texture):
+    """Filters of one tile whose lights are not displaced."""
+    still = np.zeros((3, 2, 1, 1))
+    tile = Tiles(specific=np.reshape(specific, (3, 1, 1)), noise=NOISE, displacement=still, glints=still)
+    return FilterTables().find(tile, texture, "RGGB", OWN_LIGHT)
 
 
 def test_filters_sum_to_one_and_follow_the_trust():
     texture = TextureModel.of_speckle(4.0)
-    _, alike, _ = prediction_filters(np.full((3, 1, 1), 1e-3), NOISE, texture, "RGGB", **STILL)
-    _, apart, _ = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), NOISE, texture, "RGGB", **STILL)
+    _, alike, _ = filters_at_rest([1e-3, 1e-3, 1e-3], texture)
+    _, apart, _ = filters_at_rest([1e-3, 1.0, 1e-3], texture)
     np.testing.assert_allclose(alike.sum(axis=3), 1, atol=0.02)
     site = site_channels((5, 5), "RGGB").ravel()
     # red at a blue pixel: what green tells counts for much less when green is in a reflection
@@ -160,7 +169,7 @@ def test_filters_sum_to_one_and_follow_the_trust():
 
 def test_filters_of_nothing_in_common_use_the_own_colour_alone():
     texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "specific": 1.0})
-    _, taps, size = prediction_filters(np.full((3, 1, 1), 2000.0), NOISE, texture, "RGGB", **STILL)
+    _, taps, size = filters_at_rest([2000.0, 2000.0, 2000.0], texture)
     assert size == WIDE
     site = site_channels((8, 8), "RGGB")[1:, 1:].ravel()  # a square of 7 around red begins at blue
     for channel in range(3):
@@ -177,16 +186,10 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(by_le
     seen = np.array([[0.75, 0.25, 0], [0.05, 0.97, 0], [0.03, 0.95, 0], [0, 0.5, 0.5]])
     sparkle, of_channels = np.array([2.0**-10, 0.5, 2.0**-10]), channel_means(seen)
     grid = [part[:, :, None, None] for part in (by_lens, by_glints)]
-    _, taps, _ = prediction_filters(
-        sparkle.reshape(3, 1, 1),
-        np.full((3, 1, 1), noise),
-        texture,
-        "RGGB",
-        light_fraction=seen,
-        displacement=grid[0],
-        glints=grid[1],
-        left_out=left_out,
+    tile = Tiles(
+        specific=sparkle.reshape(3, 1, 1), noise=np.full((3, 1, 1), noise), displacement=grid[0], glints=grid[1]
     )
+    _, taps, _ = FilterTables().find(tile, texture, "RGGB", seen, left_out=left_out)
     offset, displacement = np.arange(size) - size // 2, by_lens + by_glints
     points = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
 
@@ -224,21 +227,9 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(by_le
 def test_filters_that_are_kept_are_those_made_anew():
     texture, tables, random = TextureModel.of_speckle(4.0), FilterTables(), np.random.default_rng(0)
     for _ in range(3):
-        specific = 2.0 ** random.integers(-10, 3, (3, 4, 5))
-        kept, anew = (
-            prediction_filters(
-                specific,
-                np.full((3, 4, 5), 1e-3),
-                texture,
-                "GRBG",
-                light_fraction=STILL["light_fraction"],
-                displacement=still,
-                glints=still,
-                tables=where,
-            )
-            for still in [np.zeros((3, 2, 4, 5))]
-            for where in (tables, None)
-        )
+        specific, still = 2.0 ** random.integers(-10, 3, (3, 4, 5)), np.zeros((3, 2, 4, 5))
+        tiles = Tiles(specific=specific, noise=np.full((3, 4, 5), 1e-3), displacement=still, glints=still)
+        kept, anew = (where.find(tiles, texture, "GRBG", OWN_LIGHT) for where in (tables, FilterTables()))
         np.testing.assert_array_equal(kept[1][kept[0]], anew[1][anew[0]])
 
 

@@ -12,8 +12,8 @@ from small_tests import colour_test
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording
 from rgbmidic.illumination.displacement import LightDisplacement
-from rgbmidic.illumination.histogram import saturation_pile
 from rgbmidic.illumination.images import IlluminationImages, Registration
+from rgbmidic.illumination.plane_samples import saturation_pile
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure

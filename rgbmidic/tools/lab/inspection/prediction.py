@@ -24,13 +24,12 @@ from scipy.ndimage import median_filter
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.colour_factors import MEAN_BLOCK, MIN_SPECIFIC, upsample
+from rgbmidic.illumination.colour_factors import BLOCK, CHANNEL, MEAN_BLOCK, MIN_SPECIFIC, upsample
 from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL
 from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import COLOURED, TextureModel
