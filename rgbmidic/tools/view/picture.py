@@ -450,7 +450,7 @@ class Canvas:
         except UnsetValueError:  # it has not reported yet
             return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
-            edges = dict(zip(("left", "top", "right", "bottom"), self.requested_edges, strict=True))
+            edges = dict(zip(("x_min", "y_min", "x_max", "y_max"), self.requested_edges, strict=True))
             self._set_window(replace(self.window, **edges, width=width, height=height))
 
     def _receive_ranges(self, event: Any) -> None:

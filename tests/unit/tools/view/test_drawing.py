@@ -78,6 +78,15 @@ def drawing_on(marks):
     return drawing, Browser(canvas)
 
 
+def test_a_canvas_shows_what_was_asked_for_in_the_size_that_the_browser_reports():
+    canvas = Canvas(Document(), ("point",), (0, 0, 150, 120), lambda: None)
+    for name in ("inner_width", "inner_height"):
+        canvas.plot.set_from_json(name, 300)
+    assert canvas.window.size == (300, 300)
+    assert canvas.window.edges == (0, -15, 150, 135)
+    assert (canvas.plot.y_range.start, canvas.plot.y_range.end) == (135, -15)
+
+
 @pytest.mark.parametrize("answered", [0, 1, 2, 3])
 def test_corners_that_are_drawn_while_the_server_is_busy_stay(answered):
     """Four corners at once over a rectangle; so many are sent after an answer to the first has come."""
