@@ -174,7 +174,7 @@ class CurvePanel:
         quantities = [] if self.histories is None else [quantity.name for quantity in self.histories.quantities]
         probe_quantities = [name for name in quantities if name not in names]
         for entry, blank_label, choices in (
-            ("trigger", "choose", names), ("align", "choose", names), ("force", "the one in N or kN", names),
+            ("trigger", "choose", names), ("align", "choose", names), ("force", "in N or kN", names),
             ("beside", "none", names), ("align_to", "choose", probe_quantities), ("along", "time", quantities),
         ):  # fmt: skip
             selected = getattr(view, entry)
