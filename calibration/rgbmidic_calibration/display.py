@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rgbmidic.cli.command import name_options
 from rgbmidic.errors import CalibrationError
 from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration, distorted
 from rgbmidic.illumination.calibration import Calibration
@@ -120,7 +121,9 @@ def verdict(checks: Sequence[Check]) -> None:
         table.add_row(escape(item.name), figure, f"{item.limit:g} {item.unit}", word)
     doubts = [check.text for check in reported(checks) if not check.name]
     sums = (escape(item.text) for item in figures if item.text)
-    skipped = (f"[dim]{escape(check.text)}[/]" for check in checks if not check.name and check.text not in doubts)
+    skipped = (
+        f"[dim]{escape(name_options(check.text))}[/]" for check in checks if not check.name and check.text not in doubts
+    )
     failed = sum(not item.passed for item in figures)
     words = f"[bold red]FAILED[/]: {failed} of {len(figures)} figures break their limit"
     _print([*_warning_lines(doubts), table, *sums, *skipped, words if failed else "[bold green]PASSED[/]"])
@@ -187,7 +190,7 @@ def _table(title: str, heads: Sequence[str], justify: Literal["left", "right"] =
 
 
 def _warning_lines(warnings: Sequence[str]) -> list[str]:
-    return [f"[yellow]warning:[/] {escape(warning)}" for warning in warnings]
+    return [f"[yellow]warning:[/] {escape(name_options(warning))}" for warning in warnings]
 
 
 def _written_line(out: Path) -> str:
