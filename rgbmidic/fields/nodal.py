@@ -24,6 +24,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
 from rgbmidic.illumination.displacement import BIAS_CORRELATION_RANGE
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.recovery import Recovery
@@ -52,6 +53,8 @@ class NodalCovariance:
     bias : csr_matrix, shape (n, S)
         Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
         ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
+    surface : ndarray, shape (N, 3), or None
+        Places of the mesh's nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class NodalCovariance:
     mesh: Tri3Mesh
     fit: sp.csr_matrix
     bias: sp.csr_matrix
+    surface: FloatArray | None = None
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
@@ -151,6 +155,38 @@ class NodalCovariance:
         ndarray, shape (...)
         """
         return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
+
+    def of_sums(self, weights: FloatArray, displacement: Displacement) -> FloatArray:
+        """Compute the covariance of S weighted sums of each of the c components of a displacement.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (..., S, n)
+            Of the nodes.
+        displacement
+            Of the n nodes, shape (c, ..., n).
+
+        Returns
+        -------
+        ndarray, shape (..., c S, c S)
+            Sums of the first component, then those of the next.
+        """
+        std, count = displacement.uncertainty[..., None, :], len(displacement.values)
+        if displacement.covariance is None:
+            bias = np.zeros_like(std) if displacement.bias is None else displacement.bias[..., None, :]
+            errors = [self.errors(weights, *terms) for terms in zip(std, bias, strict=True)]
+            blocks = [array @ np.swapaxes(array, -1, -2) for array in errors]
+            sums = weights.shape[-2]
+            covariance = np.zeros((*weights.shape[:-2], count, sums, count, sums))
+            for row, block in enumerate(blocks):
+                covariance[..., row, :, row, :] = block
+            return covariance.reshape(*weights.shape[:-2], count * sums, count * sums)
+        matrix = np.moveaxis(np.nan_to_num(displacement.covariance), (0, 1), (-2, -1))
+        roots, axes = np.linalg.eigh(matrix)
+        factor = np.moveaxis(axes * np.sqrt(np.maximum(roots, 0))[..., None, :], (-2, -1), (0, 1))[..., None, :]
+        rows = [[self.errors(weights * np.sign(part), np.abs(part)) for part in row] for row in factor]
+        flat = np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
+        return np.asarray(flat @ np.swapaxes(flat, -1, -2))
 
     def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
         """Return the covariance of quantities (n,), each over its standard uncertainty.
@@ -331,39 +367,36 @@ class RigidMotion:
     ----------
     centre : ndarray, shape (2,)
         Middle of the measured nodes on the reference, px: the shift is that of this point.
-    shift, shift_std : ndarray, shape (2,)
-        In px.
-    rotation, rotation_std : float
-        In rad, from x towards y.
+    shift
+        In px, shape (2,).
+    rotation
+        In rad, from x towards y; a number.
 
     Examples
     --------
     >>> from rgbmidic.mesh import Region
     >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
     >>> zero = np.zeros(len(mesh.nodes))
-    >>> motion = RigidMotion.of(NodalCovariance.from_mesh(mesh), zero + 1, zero, zero + 0.01, zero + 0.01)
-    >>> motion.shift.round(6).tolist()
+    >>> shifted = Displacement.in_plane(zero + 1, zero, zero + 0.01, zero + 0.01)
+    >>> motion = RigidMotion.of(NodalCovariance.from_mesh(mesh), shifted)
+    >>> motion.shift.values.round(6).tolist()
     [1.0, 0.0]
     """
 
     centre: FloatArray
-    shift: FloatArray
-    shift_std: FloatArray
-    rotation: float
-    rotation_std: float
+    shift: Field
+    rotation: Field
 
     @classmethod
-    def of(cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray) -> Self:
+    def of(cls, covariance: NodalCovariance, displacement: Displacement) -> Self:
         """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
         Parameters
         ----------
         covariance
             Of the mesh.
-        u, v : ndarray, shape (N,)
-            In px; NaN where not measured.
-        *std : ndarray, shape (N,)
-            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
+        displacement
+            Of its N nodes in one frame, shape (2, N); NaN where not measured.
 
         Returns
         -------
@@ -374,13 +407,13 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, is_measured = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
+        nodes, is_measured = covariance.mesh.nodes, displacement.is_measured
         if is_measured.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
         centre = nodes[is_measured].mean(axis=0)
-        arm, displacement = nodes[is_measured] - centre, np.stack([u, v], axis=1)[is_measured]
-        shift = displacement.mean(axis=0)
-        deformed = arm + displacement - shift
+        arm, values = nodes[is_measured] - centre, displacement.values.T[is_measured]
+        shift = values.mean(axis=0)
+        deformed = arm + values - shift
         along, turned = (arm * deformed).sum(), (arm[:, 0] * deformed[:, 1] - arm[:, 1] * deformed[:, 0]).sum()
         equal_weights = is_measured / is_measured.sum()
         lever, angle = np.zeros((2, len(nodes))), float(np.arctan2(turned, along))
@@ -388,19 +421,17 @@ class RigidMotion:
         c, s = np.cos(angle), np.sin(angle)
         lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
-        u_std, v_std = std[::2], std[1::2]
-        turning = covariance.variance(lever[0], *u_std) + covariance.variance(lever[1], *v_std)
+        bias = np.zeros_like(displacement.values) if displacement.bias is None else displacement.bias
+        terms = [*zip(displacement.uncertainty, bias, strict=True)]
+        variances = [covariance.variance(equal_weights, *component) for component in terms]
+        turning = sum(covariance.variance(arms, *term) for arms, term in zip(lever, terms, strict=True))
         return cls(
             centre=centre,
-            shift=shift,
-            shift_std=np.sqrt(
-                np.array([covariance.variance(equal_weights, *component_std) for component_std in (u_std, v_std)])
-            ),
-            rotation=angle,
-            rotation_std=float(np.sqrt(turning)),
+            shift=Field(name="rigid", unit="px", dims=("component",), values=shift, std=np.sqrt(variances)),
+            rotation=Field(name="rigid_rotation", unit="rad", dims=(), values=np.array(angle), std=np.sqrt(turning)),
         )
 
-    def removed(self, nodes: FloatArray, field: FloatArray) -> FloatArray:
+    def removed(self, nodes: FloatArray, displacement: Displacement) -> Displacement:
         """Subtract the rigid motion from a displacement field: the field in axes that move with the body.
 
         The remaining displacements are rotated back, so that lengths and strains stay as they are.
@@ -409,20 +440,35 @@ class RigidMotion:
         ----------
         nodes : ndarray, shape (N, 2)
             In px on the reference.
-        field : ndarray, shape (4, N) or (6, N)
-            u, v, their standard uncertainty, and the part that the lights' bias leaves, px. The uncertainty of the
-            rigid motion itself is not added: it is the less, the more nodes there are.
+        displacement
+            In px, shape (2, N). The uncertainty of the rigid motion itself is not added: it is the less, the more nodes
+            there are.
 
         Returns
         -------
-        ndarray, shape (4, N) or (6, N)
-            As `field`.
+        Displacement
         """
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        back = np.array([[c, s], [-s, c]])
         arm = nodes - self.centre
-        remaining = (arm + field[:2].T - self.shift) @ back.T - arm
-        return np.concatenate([remaining.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
+        turned = displacement.with_arrays(lambda std: np.sqrt(self.back**2 @ std**2))
+        remaining = (arm + displacement.values.T - self.shift.values) @ self.back.T - arm
+        return replace(turned, values=remaining.T)
+
+    @property
+    def components(self) -> Field:
+        """Shift in px and rotation in degrees, shape (3,)."""
+        terms = zip(
+            (self.shift.values, self.shift.uncertainty),
+            (self.rotation.values, self.rotation.uncertainty),
+            strict=True,
+        )
+        values, std = (np.append(shift, np.degrees(angle)) for shift, angle in terms)
+        return Field(name="rigid", dims=("component",), values=values, std=std)
+
+    @property
+    def back(self) -> FloatArray:
+        """Rotation (2, 2) by the opposite angle."""
+        c, s = np.cos(self.rotation.values), np.sin(self.rotation.values)
+        return np.array([[c, s], [-s, c]])
 
     def at(self, points: FloatArray) -> FloatArray:
         """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.
@@ -436,5 +482,4 @@ class RigidMotion:
         -------
         ndarray, shape (P, 2)
         """
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)
+        return np.asarray((points - self.centre) @ (self.back - np.eye(2)) + self.shift.values)

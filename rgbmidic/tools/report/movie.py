@@ -171,11 +171,16 @@ class FieldMovie:
         for name in self.fields:
             colour_values, field = [], maps.field(name)
             for frame in frames:
-                map_values = maps.read(name, frame)
-                colour_values.append(style.ordinary_values(map_values.values, map_values.std))
-                deformed = map_values.deformed_nodes[np.isfinite(map_values.deformed_nodes).all(axis=1)]
-                if self.images is not None and len(deformed):
-                    corners.append(np.stack([deformed.min(axis=0), deformed.max(axis=0)]))
+                nodal = maps.read(name, frame)
+                colour_values.append(style.ordinary_values(nodal.values, nodal.uncertainty))
+                if self.images is not None:
+                    deformed = maps.deformed_nodes(frame)
+                    deformed = deformed[np.isfinite(deformed).all(axis=1)]
+                    corners += (
+                        [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
+                        if len(deformed)
+                        else []
+                    )
             finite_values = np.concatenate(colour_values)
             if not finite_values.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
@@ -342,10 +347,10 @@ class _Canvas:
             axis.draw_artist(self._cursor)
         page = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
         picture = self._reference if movie.images is None else movie.images(frame)
+        nodes = result.nodes if movie.images is None else movie.maps.deformed_nodes(frame)
         for box, panel in zip(self.boxes, self._panels, strict=True):
-            values = movie.maps.read(panel.field.name, frame)
-            nodes = result.nodes if movie.images is None else values.deformed_nodes
-            vertices, elements = movie.maps.triangulate(panel.field, np.column_stack([nodes, values.values]))
+            values = movie.maps.read(panel.field.name, frame).values
+            vertices, elements = movie.maps.triangulate(panel.field, np.column_stack([nodes, values]))
             overlay = Overlay(
                 nodes=vertices[:, :2],
                 elements=elements,

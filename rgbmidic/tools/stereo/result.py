@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 import numpy as np
 
 from rgbmidic.errors import InputError, ResultError, import_optional
-from rgbmidic.fields.units import column
+from rgbmidic.field import column
 from rgbmidic.results import ResultQuantity
 from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
 from rgbmidic.typing import AnyArray, FloatArray
