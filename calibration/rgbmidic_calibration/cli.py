@@ -149,7 +149,7 @@ def camera(
 ) -> None:
     """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
     from rgbmidic.fields.plane import CameraCalibration
-    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration import display, jobs, pictures
     from rgbmidic_calibration.target import Target
 
     check_output(out, overwrite=overwrite)
@@ -171,7 +171,7 @@ def camera(
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
     if picture is not None:
-        display.draw_camera(estimate.camera, picture, estimate.residuals)
+        pictures.draw_camera(estimate.camera, picture, estimate.residuals)
 
 
 @app.command()
@@ -292,14 +292,14 @@ def design(
 ) -> None:
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
-    from rgbmidic_calibration import display
+    from rgbmidic_calibration import display, pictures
 
     lamps = {name: designs.read_lamp(text) for name, text in read_name_patterns(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
     ranked_sets = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
     display.designs(ranked_sets[:show_sets])
     if picture is not None:
-        display.draw_design(ranked_sets[0], sensitivities, lamps, picture)
+        pictures.draw_design(ranked_sets[0], sensitivities, lamps, picture)
 
 
 @app.command()
@@ -323,7 +323,7 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.tools.stereo import CameraPair
-    from rgbmidic_calibration import display
+    from rgbmidic_calibration import display, pictures
 
     if CameraPair.is_in(file):
         display.stereo(CameraPair.read(file), file, is_written=False)
@@ -334,9 +334,9 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
         camera = CameraCalibration.read(file)
         display.camera(camera, file, is_written=False)
         if picture is not None:
-            display.draw_camera(camera, picture)
+            pictures.draw_camera(camera, picture)
         return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)
     if picture is not None:
-        display.draw_calibration(calibration, picture)
+        pictures.draw_calibration(calibration, picture)
