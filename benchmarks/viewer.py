@@ -15,8 +15,8 @@ from results import make_result
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.settings import TestSettings
+from rgbmidic.tools.report.painter import ImageWindow, Overlay, paint, palette
 from rgbmidic.tools.view.fields import FieldsInView
-from rgbmidic.tools.view.picture import ImageWindow, Overlay, paint, palette
 from rgbmidic.tools.view.url_state import ViewState
 
 from .tables import table

@@ -309,7 +309,8 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
     if rms > LIMITS.max_residual and std is None:
         raise CalibrationError(
             f"{view.name}: the points are off the plane by {rms:.2f} px rms, at most {LIMITS.max_residual:g} "
-            "is what a flat target leaves" + (": calibrate the lens too, with --views" if lens is None else "")
+            "is what a flat target leaves"
+            + (": calibrate the lens too, from views at several angles" if lens is None else "")
         )
     variance = std**2 if std is not None else float((residual**2).sum()) / (residual.size - 8)
     covariance = np.zeros((16, 16))

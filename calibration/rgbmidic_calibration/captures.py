@@ -160,10 +160,10 @@ class Captures:
         for names in simultaneous or ():
             if missing := [name for name in names.split("+") if name not in lights]:
                 raise ConfigurationError(
-                    f"--together {names} needs the single captures of {', '.join(missing)} too (--light)"
+                    f"`simultaneous` {names} needs the single captures of {', '.join(missing)} too (`lights`)"
                 )
             if "+" not in names:
-                raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
+                raise ConfigurationError(f"`simultaneous` takes NAME+NAME=FILES, at least two lights, not {names}")
 
         def find_files(role: str, pattern: str) -> CaptureFiles:
             return CaptureFiles.find(role, pattern, user_metadata, calibration)

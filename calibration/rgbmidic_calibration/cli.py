@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,27 +10,30 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic.cli import command
-from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.errors import ConfigurationError
+from rgbmidic_calibration.options import (
+    CAPTURE_OPTIONS,
+    PAIR_LIGHTS,
+    PAIR_OPTIONS,
+    Out,
+    Overwrite,
+    Region,
+    capture_finder,
+    check_output,
+    read_distance,
+    read_frame_settings,
+    read_limits,
+    read_name_patterns,
+    read_pair_lights,
+    read_region,
+    takes_captures,
+    writes_file,
+)
 
 if TYPE_CHECKING:
-    from rgbmidic.settings import FrameSettings
-    from rgbmidic_calibration.captures import Captures
     from rgbmidic_calibration.verify import Limits
 
 app = command.application("rgbmidic-calibrate")
-
-Out = Annotated[Path, Option(help="Calibration file to write (JSON).")]
-Region = Annotated[str | None, Option(help="x0,y0,x1,y1 in px: region of the speckled target.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file.")]
-CAPTURE_OPTIONS: dict[str, Any] = {
-    "light": Annotated[
-        list[str], Option("--light", help="NAME=FILES: captures with only this light on. Once per light.")
-    ],
-    "dark": Annotated[str | None, Option("--dark", help="Captures with all lamps off (and the same ambient light).")],
-    **command.FRAME_OPTIONS,
-}
-
-Command = Callable[..., None]
 
 
 def main() -> None:
@@ -49,119 +49,9 @@ def _root(
     command.print_help_without_command(context)
 
 
-def _frame_settings(options: Mapping[str, Any]) -> FrameSettings:
-    """Return the settings of captures as options state them; an option with a value that is not allowed is named."""
-    from rgbmidic.settings import FrameSettings
-
-    try:
-        return FrameSettings(path=("captures",), **command.read_statement(options))
-    except ConfigurationError as error:
-        as_options = re.sub(r"frames\.(\w+)", lambda key: "--" + key[1].replace("_", "-"), str(error))
-        raise ConfigurationError(as_options) from None
-
-
-def _capture_finder(options: dict[str, Any]) -> partial[Captures]:
-    """Return a call that finds the captures which options name."""
-    from rgbmidic_calibration.captures import Captures
-
-    lights, dark = read_name_patterns(options.pop("light") or (), "--light"), options.pop("dark")
-    return partial(Captures.find, lights, dark, _frame_settings(options))
-
-
-def read_name_patterns(options: Sequence[str], option: str) -> dict[str, str]:
-    """Split options of the form NAME=FILES.
-
-    Raises
-    ------
-    ConfigurationError
-        An option has another form, or a name occurs twice.
-    """
-    pattern_by_name: dict[str, str] = {}
-    for text in options:
-        name, separator, pattern = text.partition("=")
-        name, pattern = name.strip(), pattern.strip()
-        if not (separator and name and pattern):
-            raise ConfigurationError(f"{option} takes NAME=FILES, as in {option} red='light_red/*.tif', not {text!r}")
-        if name in pattern_by_name:
-            raise ConfigurationError(f"{option} {name} is given twice; one pattern may match many files")
-        pattern_by_name[name] = pattern
-    return pattern_by_name
-
-
-def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
-    """Refuse to write where that would lose something.
-
-    Raises
-    ------
-    ConfigurationError
-        The file exists and may not be overwritten, or its folder does not exist.
-    """
-    if path.is_dir():
-        raise ConfigurationError(f"{option} {path} is a folder; state a file name")
-    if path.exists() and not overwrite:
-        raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
-    if not path.parent.is_dir():
-        raise ConfigurationError(f"the folder of {option} {path} does not exist")
-
-
-def read_limits(options: Sequence[str]) -> Limits:
-    """Return the limits from options of the form NAME=VALUE.
-
-    Raises
-    ------
-    ConfigurationError
-        An unknown name, or a value that is not a positive number.
-    """
-    from rgbmidic_calibration.verify import LIMITS
-
-    limits, names = LIMITS, [entry.name for entry in fields(LIMITS)]
-    for text in options:
-        name, _, value = text.partition("=")
-        try:
-            number = float(value)
-        except ValueError:
-            number = -1.0
-        if name not in names or not number > 0:
-            raise ConfigurationError(
-                f"--limit takes NAME=VALUE with a positive value and one of the names {', '.join(names)}, not {text!r}"
-            )
-        limits = replace(limits, **{name: number})
-    return limits
-
-
-def _distance(text: str) -> tuple[tuple[float, ...], float]:
-    """Ends (x0, y0, x1, y1) in px and length in mm of ``X0,Y0:X1,Y1=MM``; a `ConfigurationError` for anything else."""
-    ends, _, length = text.partition("=")
-    try:
-        return command.read_coordinates(ends, "--distance", "X0,Y0:X1,Y1"), float(length.removesuffix("mm"))
-    except (InputError, ValueError):
-        form = "X0,Y0:X1,Y1=MM, such as 120,85:840,85=25"
-        raise ConfigurationError(f"--distance is {form}, not {text!r}") from None
-
-
-def _region(text: str | None) -> tuple[float, ...] | None:
-    return command.read_coordinates(text, "--region", "X0,Y0,X1,Y1") if text else None
-
-
-_takes_captures = command.collect_options("captures", CAPTURE_OPTIONS, _capture_finder, light=command.REQUIRED)
-
-
-def _writes_file(name: str, hint: Any, default: str | None = None) -> Callable[[Command], Command]:
-    """Return the decorator of a command with a file to write, which may replace another only where that is stated."""
-
-    def read(options: Mapping[str, Any]) -> Path | None:
-        path: Path | None = options[name]
-        if path is not None:
-            check_output(path, overwrite=options["overwrite"], option=f"--{name}")
-        return path
-
-    defaults = {name: default and Path(default), "overwrite": False}
-    return command.collect_options(name, {name: hint, "overwrite": Overwrite}, read, **defaults)
-
-
 @app.command()
-@_writes_file("out", Out, "calibration.json")
-@_takes_captures
+@writes_file("out", Out, "calibration.json")
+@takes_captures
 def crosstalk(
     captures: Any,
     out: Path,
@@ -183,8 +73,8 @@ def crosstalk(
 
 
 @app.command()
-@_writes_file("out", Out, "noise.json")
-@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@writes_file("out", Out, "noise.json")
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, read_frame_settings)
 def noise(
     dark: Annotated[str, Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -206,8 +96,8 @@ def noise(
 
 
 @app.command()
-@_writes_file("out", Out, "registration.json")
-@_takes_captures
+@writes_file("out", Out, "registration.json")
+@takes_captures
 def registration(
     captures: Any,
     out: Path,
@@ -220,13 +110,15 @@ def registration(
     """Measure lateral colour: the shift of each light's image relative to that of the first light."""
     from rgbmidic_calibration import display, jobs
 
-    calibration, estimate = jobs.calibrate_registration(captures(), region=_region(region), element_size=element_size)
+    calibration, estimate = jobs.calibrate_registration(
+        captures(), region=read_region(region), element_size=element_size
+    )
     calibration.write(out)
     display.registration(estimate, out)
 
 
 @app.command()
-@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, read_frame_settings)
 @command.collect_options("target_lights", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def camera(
     user_metadata: Any,
@@ -257,7 +149,7 @@ def camera(
 ) -> None:
     """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
     from rgbmidic.fields.plane import CameraCalibration
-    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration import display, jobs, pictures
     from rgbmidic_calibration.target import Target
 
     check_output(out, overwrite=overwrite)
@@ -279,41 +171,15 @@ def camera(
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
     if picture is not None:
-        display.draw_camera(estimate.camera, picture, estimate.residuals)
-
-
-_PAIR_OPTIONS: dict[str, Any] = {
-    "left": Annotated[str, Option(help="Photographs of the target by the left camera.")],
-    "right": Annotated[str, Option(help="Photographs at the same moments by the right camera, in the same order.")],
-    "target": Annotated[str, Option(help="KIND:COLUMNSxROWS:SPACINGmm, as of `camera`.")],
-}
-_PAIR_LIGHTS: dict[str, Any] = {
-    "light": Annotated[list[str] | None, Option(help="NAME of the light of the photographs; once per light.")],
-    "left_calibration": Annotated[
-        Path | None, Option(help="Calibration of the left camera, whose registration counts.")
-    ],
-    "right_calibration": Annotated[Path | None, Option(help="The same of the right camera.")],
-}
-
-
-def _read_pair_lights(options: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the lights of the photographs for either camera, see `command.read_target_lights`."""
-    files = options["left_calibration"], options["right_calibration"]
-    if (files[0] is None) != (files[1] is None):
-        raise ConfigurationError("--left-calibration and --right-calibration belong together: state both")
-    left, right = (
-        command.read_target_lights({"light": options["light"], "calibration": file, "crop_origin": None})
-        for file in files
-    )
-    return left, right
+        pictures.draw_camera(estimate.camera, picture, estimate.residuals)
 
 
 @app.command()
-@_writes_file("out", Annotated[Path, Option(help="File of both cameras to write (JSON).")], "stereo.json")
-@command.collect_options("lights", _PAIR_LIGHTS, _read_pair_lights)
-@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@writes_file("out", Annotated[Path, Option(help="File of both cameras to write (JSON).")], "stereo.json")
+@command.collect_options("lights", PAIR_LIGHTS, read_pair_lights)
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, read_frame_settings)
 @command.collect_options(
-    "views", _PAIR_OPTIONS, dict, left=command.REQUIRED, right=command.REQUIRED, target=command.REQUIRED
+    "views", PAIR_OPTIONS, dict, left=command.REQUIRED, right=command.REQUIRED, target=command.REQUIRED
 )
 def stereo(views: Any, user_metadata: Any, lights: Any, out: Path) -> None:
     """Calibrate two cameras, lenses and relative pose, from simultaneous photographs of a target."""
@@ -327,8 +193,8 @@ def stereo(views: Any, user_metadata: Any, lights: Any, out: Path) -> None:
 
 
 @app.command()
-@command.collect_options("captures", CAPTURE_OPTIONS, _capture_finder)
-@command.collect_options("views", _PAIR_OPTIONS, dict)
+@command.collect_options("captures", CAPTURE_OPTIONS, capture_finder)
+@command.collect_options("views", PAIR_OPTIONS, dict)
 def check(
     file: Annotated[
         Path, Argument(help="Calibration file; camera file with --distance; file of two cameras with --left, --right.")
@@ -365,7 +231,7 @@ def check(
     elif any(views.values()):
         raise ConfigurationError(f"--left, --right and --target are for a file of two cameras, and {file} is none")
     elif CameraCalibration.is_in(file):
-        true_distances = [_distance(text) for text in distance or ()]
+        true_distances = [read_distance(text) for text in distance or ()]
         if not true_distances:
             raise ConfigurationError(f"{file} is a camera file: state a known distance, --distance X0,Y0:X1,Y1=MM")
         checks = check_distances(CameraCalibration.read(file), true_distances, corner_std=corner_std, limits=limits)
@@ -376,7 +242,7 @@ def check(
         check_captures = captures(
             calibration=calibration, simultaneous=read_name_patterns(together or (), "--together")
         )
-        checks = check_calibration(calibration, check_captures, limits=limits, region=_region(region))
+        checks = check_calibration(calibration, check_captures, limits=limits, region=read_region(region))
     display.verdict(checks)
     if not all(figure.passed for figure in checks):
         raise typer.Exit(1)
@@ -408,7 +274,7 @@ def _check_pair(file: Path, captures: Any, views: Mapping[str, Any], distances: 
 
 
 @app.command()
-@_writes_file("picture", Annotated[Path | None, Option(help="Picture of spectra and matrix of the best set.")])
+@writes_file("picture", Annotated[Path | None, Option(help="Picture of spectra and matrix of the best set.")])
 def design(
     camera: Annotated[
         str, Option(help="FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a camera of colour-science.")
@@ -426,18 +292,18 @@ def design(
 ) -> None:
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
-    from rgbmidic_calibration import display
+    from rgbmidic_calibration import display, pictures
 
     lamps = {name: designs.read_lamp(text) for name, text in read_name_patterns(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
     ranked_sets = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
     display.designs(ranked_sets[:show_sets])
     if picture is not None:
-        display.draw_design(ranked_sets[0], sensitivities, lamps, picture)
+        pictures.draw_design(ranked_sets[0], sensitivities, lamps, picture)
 
 
 @app.command()
-@_writes_file("out", Out, "calibration.json")
+@writes_file("out", Out, "calibration.json")
 def merge(
     files: Annotated[list[Path], Argument(help="Calibration files; common sections must be equal.")], out: Path
 ) -> None:
@@ -451,13 +317,13 @@ def merge(
 
 
 @app.command()
-@_writes_file("picture", Annotated[Path | None, Option(help="Write a picture too (PNG, PDF or SVG).")])
+@writes_file("picture", Annotated[Path | None, Option(help="Write a picture too (PNG, PDF or SVG).")])
 def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Path | None = None) -> None:
     """Show a calibration or camera file as tables, and in one picture."""
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.tools.stereo import CameraPair
-    from rgbmidic_calibration import display
+    from rgbmidic_calibration import display, pictures
 
     if CameraPair.is_in(file):
         display.stereo(CameraPair.read(file), file, is_written=False)
@@ -468,9 +334,9 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
         camera = CameraCalibration.read(file)
         display.camera(camera, file, is_written=False)
         if picture is not None:
-            display.draw_camera(camera, picture)
+            pictures.draw_camera(camera, picture)
         return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)
     if picture is not None:
-        display.draw_calibration(calibration, picture)
+        pictures.draw_calibration(calibration, picture)

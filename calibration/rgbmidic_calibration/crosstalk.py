@@ -476,7 +476,7 @@ def matrix_checks(fits: Sequence[LightFit], design: FloatArray) -> Iterator[Chec
         if name in COLOURS and name != COLOURS[signal.reference]:
             text = (
                 f"light {signal.name} is seen best by the {COLOURS[signal.reference]} channel: are the captures of two "
-                "lights swapped, or is the colour filter array (--cfa) another one?"
+                "lights swapped, or is the colour filter array (`cfa`) another one?"
             )
             yield Check("name", text)
     for index, signal in enumerate(signals):

@@ -67,7 +67,7 @@ def calibrate_noise(dark: str, flats: Sequence[str], user_metadata: FrameSetting
         try:
             seconds = float(time)
         except ValueError:
-            raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
+            raise ConfigurationError(f"`flats` are FILES or TIME=FILES with a number as time, not {text!r}") from None
         groups.append(replace(CaptureFiles.find(f"flat exposure {time}", pattern, user_metadata), exposure=seconds))
     dark_frames, *flat_stacks = [files.stack() for files in groups]
     estimate = photon_transfer(dark_frames, flat_stacks)
@@ -118,7 +118,7 @@ def _calibration(
     )
 
 
-def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) -> View:
+def read_corners(corners: str, size: str, corner_std: float, shape: tuple[int, int]) -> View:
     """Read the corners of a rectangle on the specimen, in px, and its two sides in mm.
 
     Parameters
@@ -127,7 +127,7 @@ def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) ->
         ``X0,Y0:X1,Y1:X2,Y2:X3,Y3`` in the order around the rectangle, beginning at its top left.
     size
         ``WIDTHxHEIGHTmm``.
-    std
+    corner_std
         Standard uncertainty of a corner, px.
     shape
         Rows and columns of the frames.
@@ -144,21 +144,21 @@ def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) ->
         width, height = (float(side) for side in sides.groups()) if sides else (0.0, 0.0)
     except ValueError:
         pixels, width, height = np.zeros(0), 0.0, 0.0
-    if pixels.shape != (4, 2) or not np.isfinite(pixels).all() or not (width > 0 and height > 0 and std > 0):
+    if pixels.shape != (4, 2) or not np.isfinite(pixels).all() or not (width > 0 and height > 0 and corner_std > 0):
         raise ConfigurationError(
-            "--corners is X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px around a rectangle and --size its WIDTHxHEIGHTmm, "
-            f"--corner-std positive; not {corners!r}, {size!r}, {std:g}"
+            "`corners` are X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px around a rectangle and `size` its WIDTHxHEIGHTmm, "
+            f"`corner_std` is positive; not {corners!r}, {size!r}, {corner_std:g}"
         )
     if (pixels < -0.5).any() or (pixels > np.array(shape[::-1]) - 0.5).any():
-        raise ConfigurationError(f"--corners lie outside the frame of {shape[1]} x {shape[0]} px: {corners}")
+        raise ConfigurationError(f"`corners` lie outside the frame of {shape[1]} x {shape[0]} px: {corners}")
     steps = np.roll(pixels, -1, axis=0) - pixels
     turns = steps[:, 0] * np.roll(steps[:, 1], -1) - steps[:, 1] * np.roll(steps[:, 0], -1)
     if not (turns > 0).all():
         raise ConfigurationError(
-            f"--corners must go around the rectangle clockwise from its top left; given: {corners}"
+            f"`corners` must go around the rectangle clockwise from its top left; given: {corners}"
         )
     points = np.array([[0, 0], [width, 0], [width, height], [0, height]])
-    return View(name="--corners", points=points, pixels=pixels, shape=shape)
+    return View(name="corners", points=points, pixels=pixels, shape=shape)
 
 
 def calibrate_camera(
@@ -194,7 +194,7 @@ def calibrate_camera(
         Neither photographs of the lens nor a plane are given, or photographs without their target.
     """
     if (isinstance(lens, str) or isinstance(plane, str)) and target is None:
-        raise ConfigurationError("--views and --plane need --target, what the photographs show")
+        raise ConfigurationError("photographs of lens or plane need `target`: what they show")
     groups, estimates = list[CaptureFiles](), list[CameraEstimate]()
     camera, view = None, None
     if isinstance(lens, str) and target:
@@ -210,7 +210,9 @@ def calibrate_camera(
     elif isinstance(plane, tuple):
         shape = camera.shape if camera is not None else user_metadata.shape
         if shape is None:
-            raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
+            raise ConfigurationError(
+                "corners of the plane need the frames' size: state their `shape` (rows, columns), or a `lens`"
+            )
         view = read_corners(*plane, shape)
     if view is not None:
         camera = camera or CameraCalibration(shape=view.shape)
@@ -218,7 +220,9 @@ def calibrate_camera(
         estimates.append(estimate_plane(_on_first_light(view, lights), camera, std))
         camera = estimates[-1].camera
     if camera is None or not estimates:
-        raise ConfigurationError("nothing to calibrate: state --views, --plane or --corners")
+        raise ConfigurationError(
+            "nothing to calibrate: state views of the lens, a photograph of the plane, or corners on it"
+        )
     details = {**camera.details, "provenance": provenance("camera", groups, {})}
     if lights is not None:
         details |= {"lights": list(lights.names), "first_light": lights.first}
@@ -260,8 +264,8 @@ def find_view_pairs(
     if None in times[0] or None in times[1]:
         if len(series[0]) != len(series[1]):
             raise CalibrationError(
-                f"--left has {len(series[0])} photographs, --right {len(series[1])}: paired by number, both must have "
-                "as many, of the same moments in the same order"
+                f"the left camera has {len(series[0])} photographs, the right {len(series[1])}: paired by number, both "
+                "must have as many, of the same moments in the same order"
             )
         indices = [(index, index) for index in range(len(series[0]))]
     else:
@@ -272,7 +276,7 @@ def find_view_pairs(
         indices = [(row, int(nearest[row])) for row in range(len(nearest)) if delays[row].min() < interval / 4]
         if not indices:
             raise CalibrationError(
-                f"no photographs of --left and --right were taken at one time: the nearest are "
+                f"no photographs of the left and the right camera were taken at one time: the nearest are "
                 f"{1e-9 * delays.min():.3g} s apart"
             )
     pairs, reasons = list[ViewPair](), list[str]()
@@ -347,8 +351,8 @@ def _without_plane(camera: CameraCalibration, lights: TargetLights | None) -> Ca
     if earlier_light is not None and earlier_light != present_light:
         image = "with no light stated" if present_light is None else f"of light {present_light}'s image"
         raise CalibrationError(
-            f"{camera.name} (--lens) is of light {earlier_light}'s image, the plane {image}: state --light and "
-            "--calibration as for the lens"
+            f"{camera.name} is of light {earlier_light}'s image, the plane {image}: state the same `lights` as for the "
+            "lens"
         )
     covariance = np.pad(camera.covariance[:8, :8], (0, 8))
     return replace(camera, homography=None, covariance=covariance, details={"lens": camera.details.get("lens")})
@@ -361,10 +365,10 @@ def _mean_view(files: CaptureFiles, target: Target) -> View:
         raise CalibrationError("; ".join(reasons))
     for shot in shots[1:]:
         if not np.array_equal(shot.points, shots[0].points):
-            raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
+            raise CalibrationError("plane: the photographs show different points of the target: state one of them")
         if (motion_px := float(np.abs(shot.pixels - shots[0].pixels).max())) > LIMITS.max_residual:
             raise CalibrationError(
-                f"--plane: from {shots[0].name} to {shot.name} the target moved by up to {motion_px:.2f} px, at most "
+                f"plane: from {shots[0].name} to {shot.name} the target moved by up to {motion_px:.2f} px, at most "
                 f"{LIMITS.max_residual:g} may be: state photographs of one plane"
             )
     return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))

@@ -179,7 +179,7 @@ def _require_usable(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None
         if index and stack.pile_level is not None:
             raise CalibrationError(
                 f"{name}: samples pile up at {stack.pile_level:.0f} DN, below the stated white level "
-                f"{stack.camera.white:g}: the camera saturates there; state --white-level {stack.pile_level:.0f}"
+                f"{stack.camera.white:g}: the camera saturates there; state `white_level` {stack.pile_level:.0f}"
             )
     brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
     if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:

@@ -32,7 +32,7 @@ def collect_warnings(checks: Iterable[Check], allow: Collection[str] = ()) -> li
     """
     reported_checks = reported(checks)
     if refused_checks := refused(reported_checks, allow):
-        raise CalibrationError(f"{refused_checks[0].text} (--allow {refused_checks[0].name} goes on all the same)")
+        raise CalibrationError(f"{refused_checks[0].text} (`allow` {refused_checks[0].name} goes on all the same)")
     return [check.text for check in reported_checks]
 
 
@@ -45,7 +45,7 @@ def capture_checks(lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[Bl
         There are none, they are of different cameras, or all saturated.
     """
     if not lights:
-        raise CalibrationError("no light is given: state each with --light NAME=FILES")
+        raise CalibrationError("no light is given: state each in `lights`")
     if len(lights) > 3:
         raise CalibrationError(f"a camera with three channels separates at most three lights, not {len(lights)}")
     for name in [name for name, captures in lights.items() if not captures]:
@@ -117,7 +117,7 @@ def _signal_checks(name: str, captures: Sequence[BlockMeans], signals: Sequence[
     for pile_level in [frame.pile_level for frame in captures if frame.pile_level is not None][:1]:
         text = (
             f"light {name}: samples pile up at {pile_level:.0f} DN, below the stated white level: the camera saturates "
-            f"there; state --white-level {pile_level:.0f}"
+            f"there; state `white_level` {pile_level:.0f}"
         )
         yield Check("white-level", text)
     scale = captures[0].camera.full_scale
@@ -137,7 +137,7 @@ def _signal_checks(name: str, captures: Sequence[BlockMeans], signals: Sequence[
     difference = float(np.nan_to_num(gap / max(brightest, 1e-9)))
     text = (
         f"light {name}: the two green planes differ by {100 * abs(difference):.1f} % of the strongest channel: is the "
-        "colour filter array (--cfa) right?"
+        "colour filter array (`cfa`) right?"
     )
     yield Check("greens", text, difference, limit=0.08, doubtful=0.03)
 

@@ -57,7 +57,7 @@ class Target:
         """
         match = _FORM.fullmatch(text.strip())
         form = (
-            f"--target is KIND:COLUMNSxROWS:SPACINGmm with a kind of {', '.join(_KINDS)}, such as chessboard:9x6:2.5mm "
+            f"a target is KIND:COLUMNSxROWS:SPACINGmm with a kind of {', '.join(_KINDS)}, such as chessboard:9x6:2.5mm "
             "(inner corners), charuco:8x6:10mm:7.5mm:DICT_5X5_100 (squares, markers)"
         )
         if match is None:
@@ -72,7 +72,7 @@ class Target:
                 f"{form}; at least 3 points along a side, markers smaller than squares; not {text!r}"
             )
         if not hasattr(cv2.aruco, target.dictionary):
-            raise ConfigurationError(f"--target: OpenCV has no dictionary {target.dictionary}")
+            raise ConfigurationError(f"target {text!r}: OpenCV has no dictionary {target.dictionary}")
         return target
 
     @property

@@ -26,7 +26,7 @@ from rgbmidic_calibration.stereo import ViewPair, verdicts
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Largest errors with which a calibration passes; chosen, and replaced by ``--limit`` of the command.
+    """Largest errors with which a calibration passes; chosen, and replaced by the option ``--limit``.
 
     Attributes
     ----------
@@ -317,7 +317,7 @@ def check_stereo(
     stated = float(np.linalg.norm(points[:, None] - points, axis=2).max())
     if distance is not None and not 0.9 * stated < distance < 1.1 * stated:
         raise CalibrationError(
-            f"the target's farthest points are {stated:g} mm apart by --target; a measured distance is within a tenth "
+            f"the target's farthest points are {stated:g} mm apart as stated; a measured distance is within a tenth "
             f"of that, not {distance:g} mm"
         )
     numbered = [min((view, view.renumbered), key=lambda item: item.rms(pair)) for view in views]
@@ -411,7 +411,7 @@ def check_calibration(
         The calibration has no crosstalk, or captures cannot be compared with it.
     """
     if not captures.lights:
-        raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
+        raise ConfigurationError("a check needs captures with one light on: state them in `lights`")
     calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
     if calibration.crosstalk is None:
         raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
@@ -461,5 +461,7 @@ def check_calibration(
         except CalibrationError as error:
             checks.append(Check("", f"{measure.__name__} was not checked: {error}", value=0))
     if not captures.simultaneous:
-        checks.append(Check("", "additivity was not checked: no captures with lights together (--together)", value=0))
+        checks.append(
+            Check("", "additivity was not checked: no captures with lights together (`simultaneous`)", value=0)
+        )
     return checks

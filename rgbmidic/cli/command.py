@@ -187,7 +187,10 @@ def fail(message: str, status: int = FAILURE) -> int:
 
 
 _ARGUMENT = re.compile("`([a-z_]+)(=True)?`")
-_OPTIONS = {"point_pairs": "points", "points": "point", "scale": "test"}
+_OPTIONS = {
+    "point_pairs": "points", "points": "point", "scale": "test",
+    "lights": "light", "flats": "flat", "simultaneous": "together",
+}  # fmt: skip
 """Options that have another name than the argument that they state."""
 
 

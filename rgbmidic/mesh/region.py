@@ -101,7 +101,7 @@ class Region:
         requirement = "a rectangle is four finite numbers (x0, y0, x1, y1) in px"
         corners = as_numbers(rectangle, requirement, (4,), error=RegionError)
         x0, y0, x1, y1 = corners.tolist()
-        height, width = shape = _image_shape(shape)
+        height, width = shape = image_shape(shape)
         if not (x0 < x1 and y0 < y1):
             raise RegionError(f"a rectangle (x0, y0, x1, y1) needs x0 < x1 and y0 < y1; given is {rectangle!r}")
         clipped = (max(x0, 0.0), max(y0, 0.0), min(x1, width - 1.0), min(y1, height - 1.0))
@@ -135,7 +135,7 @@ class Region:
         RegionError
             Fewer than three finite corners, or no overlap with the image.
         """
-        points, shape = _polygon(corners), _image_shape(shape)
+        points, shape = _polygon(corners), image_shape(shape)
         mask = _fill_polygon(points, shape)
         if not mask.any():
             raise RegionError(
@@ -161,6 +161,8 @@ class Region:
         RegionError
             A polygon is not three finite corners or more, or nothing is left.
         """
+        if not np.iterable(holes):
+            raise RegionError(f"holes are polygons with corners (x, y) in px; given is {holes!r}")
         if not len(holes):
             return self
         inside = [_fill_polygon(_polygon(corners), self.mask.shape) for corners in holes]
@@ -206,7 +208,7 @@ class Region:
             The mask is empty or of another size.
         """
         pixels = np.asarray(mask)
-        if shape is not None and pixels.shape != (shape := _image_shape(shape)):
+        if shape is not None and pixels.shape != (shape := image_shape(shape)):
             raise RegionError(f"the mask is {pixels.shape[::-1]} px (width, height), the images are {shape[::-1]}")
         return cls(mask=pixels != 0)
 
@@ -226,7 +228,7 @@ def _polygon(corners: npt.ArrayLike) -> FloatArray:
     return points
 
 
-def _image_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+def image_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the shape (H, W) of an image as integers; one that is none is a `RegionError`."""
     requirement = "the shape of an image is its numbers of rows and columns"
     height, width = as_numbers(cast(Any, shape), requirement, (2,), dtype=np.int64, error=RegionError).tolist()

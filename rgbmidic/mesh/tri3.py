@@ -20,8 +20,8 @@ from rgbmidic._kernels.mesh import claim_pixels, colour_nodes
 from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
-from rgbmidic.mesh.region import Region
-from rgbmidic.mesh.triangles import orient_elements
+from rgbmidic.mesh.region import Region, image_shape
+from rgbmidic.mesh.triangles import as_values, orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -118,6 +118,8 @@ class Tri3Mesh(Derivable):
         RegionError
             The region is too small for one element, or a crack misses it.
         """
+        if not isinstance(region, Region) or isinstance(cracks, str) or not np.iterable(cracks):
+            raise InputError(f"a mesh is made of a Region and of paths of cracks; given are {region!r}, {cracks!r}")
         size: Any = element_size
         if not (isinstance(size, int | float | np.number) and math.isfinite(size) and size >= 4):
             hint = ': "auto" is for rgbmidic.measure' if isinstance(size, str) and size == "auto" else ""
@@ -164,7 +166,7 @@ class Tri3Mesh(Derivable):
         RegionError
             The elements cover no pixel of the images.
         """
-        owner = np.full(shape, -1, dtype=np.int32)
+        owner = np.full(image_shape(shape), -1, dtype=np.int32)
         claim_pixels(self.nodes, self.elements, owner)
         return Region.from_mask(owner >= 0)
 
@@ -180,6 +182,7 @@ class Tri3Mesh(Derivable):
         -------
         Tri3Mesh
         """
+        nodes = as_values(nodes, "nodes", (len(self.nodes),), "b")
         node_index, is_inside = np.cumsum(nodes, dtype=np.int32) - 1, nodes[self.elements].all(axis=1)
         submesh = Tri3Mesh(nodes=self.nodes[nodes], elements=node_index[self.elements[is_inside]])
         vars(submesh).update(size=self.size, sizes=self.sizes[nodes], is_graded=self.is_graded)
@@ -219,6 +222,9 @@ class Tri3Mesh(Derivable):
         distance : ndarray, shape (N,)
         index : ndarray, shape (N,), int64
         """
+        targets = as_values(targets, "targets", (len(self.nodes),), "b")
+        if not targets.any():
+            raise InputError("targets must hold one node at least; given is none")
         if targets.all():
             return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
         (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(targets)
@@ -242,7 +248,8 @@ class Tri3Mesh(Derivable):
         -------
         ndarray, shape (N,)
         """
-        sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
+        values = as_values(per_element, "per_element", (len(self.elements),))
+        sums = np.bincount(self.elements.ravel(), weights=np.repeat(values, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
     def adjacent_nodes(self, nodes: BoolArray) -> BoolArray:
@@ -257,6 +264,7 @@ class Tri3Mesh(Derivable):
         -------
         ndarray, shape (N,), bool
         """
+        nodes = as_values(nodes, "nodes", (len(self.nodes),), "b")
         is_adjacent = np.zeros(len(self.nodes), dtype=bool)
         is_adjacent[self.elements[nodes[self.elements].any(axis=1)]] = True
         return is_adjacent
@@ -274,6 +282,7 @@ class Tri3Mesh(Derivable):
         ndarray, shape (E, C, 2)
             Per px, by the axes x and y.
         """
+        values = as_values(values, "values", (len(self.nodes), None))
         (first_x, first_y), (second_x, second_y) = _legs(self.nodes, self.elements)
         first, second = (leg / (2 * self.areas) for leg in _legs(values, self.elements))
         slopes = np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import reprlib
+
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.typing import FloatArray, as_numbers
+from rgbmidic.typing import AnyArray, FloatArray, as_numbers
 
 
 def orient_elements(
@@ -26,3 +28,25 @@ def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
     """Return twice the signed area (...) of triangles (..., 3)."""
     first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def as_values(values: npt.ArrayLike, name: str, shape: tuple[int | None, ...], kinds: str = "buif") -> AnyArray:
+    """Return what nodes or elements have as an array, NaN included; None in the shape is any length.
+
+    Raises
+    ------
+    InputError
+        It is of no numbers (of no flags, for `kinds` "b"), or of another shape.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of several lengths
+        array = np.empty(0, dtype=object)
+    shape_matches = array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind not in kinds or not shape_matches:
+        noun = "True or False" if kinds == "b" else "numbers"
+        size = ", ".join("any" if length is None else str(length) for length in shape)
+        raise InputError(f"{name} must be an array ({size}) of {noun}; given is {reprlib.repr(values)}")
+    return array

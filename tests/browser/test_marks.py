@@ -46,7 +46,7 @@ def result(tmp_path):
     x, y = MESH.nodes.T
     for index in range(41):
         stretch = 0.02 * course(index * 5e-5)
-        parts = {"u": stretch * (x - 60), "v": -0.3 * stretch * (y - 40), "exx": np.full(NODES, stretch)}
+        parts = {"u": stretch * (x - 60), "v": -0.3 * stretch * (y - 40), "nodal_exx": np.full(NODES, stretch)}
         record = smooth_record(index)
         values = {name: part.astype(record.values[name].dtype) for name, part in parts.items()}
         store.write_frame(index, replace(record, values={**record.values, **values, "time_ns": index * 50_000}))

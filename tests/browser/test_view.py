@@ -18,7 +18,7 @@ from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.tools.report import FieldMovie, write_movie
 from rgbmidic.tools.view import panels
-from rgbmidic.tools.view.picture import element_at, robust_range
+from rgbmidic.tools.view.fields import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 RIGHT, LEFT, HOME = "\ue014", "\ue012", "\ue011"

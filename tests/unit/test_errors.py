@@ -7,16 +7,20 @@ import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from typer import Typer
 from typer.main import get_command
 
 import rgbmidic
+import rgbmidic_calibration
 from rgbmidic.cli import app as cli
 from rgbmidic.cli import command
 from rgbmidic.cli.command import OnceFilter
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.settings import TestSettings
+from rgbmidic_calibration import cli as calibration
 
 
 def test_control_characters_are_spelt_out() -> None:
@@ -53,10 +57,9 @@ def test_a_text_is_shown_once() -> None:
     assert [once.filter(record) for record in records] == [True, True, False]
 
 
-def messages() -> Iterator[str]:
-    """Yield the texts of the library, without its docstrings and its commands; ``{}`` for what is filled in."""
-    package = Path(rgbmidic.__file__).parent
-    for path in (path for path in package.rglob("*.py") if "cli" not in (path.parent.name, path.stem)):
+def messages(package: Path) -> Iterator[str]:
+    """Yield the texts of a library, without its docstrings and its commands; ``{}`` for what is filled in."""
+    for path in (path for path in package.rglob("*.py") if not {"cli", "options"} & {path.parent.name, path.stem}):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         nodes = list(ast.walk(tree))
         within = {part for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node)} | {
@@ -69,11 +72,12 @@ def messages() -> Iterator[str]:
                 yield node.value
 
 
-def test_the_library_names_arguments_and_a_command_the_options_that_state_them() -> None:
-    commands = get_command(cli.app).commands.values()  # type: ignore[attr-defined]
+@pytest.mark.parametrize(("library", "app"), [(rgbmidic, cli.app), (rgbmidic_calibration, calibration.app)])
+def test_a_library_names_arguments_and_a_command_the_options_that_state_them(library: ModuleType, app: Typer) -> None:
+    commands = get_command(app).commands.values()  # type: ignore[attr-defined]
     options = {option for entry in commands for parameter in entry.params for option in parameter.opts}
     whole_command = re.compile(r"rgbmidic(-calibrate)?( [^`);]*)?")
-    for message in messages():
+    for message in messages(Path(str(library.__file__)).parent):
         if re.fullmatch("--[a-z-]+", message):  # an argument of a command that is started
             continue
         assert not re.search(r"(?<!var\()--[a-z]", whole_command.sub("", message)), message

@@ -18,14 +18,12 @@ import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Displacement, MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields import NodalCovariance, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
@@ -33,17 +31,14 @@ from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, rectification_of
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.tools.finite_elements.placement import Placement
-from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, label_indices
-from rgbmidic.typing import BoolArray, FloatArray, IntArray
+from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation
+from rgbmidic.tools.finite_elements.simulation_nodes import COMPARED_QUANTITIES, NODE_TOLERANCE, SimulationNodes
+from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)
 
-COMPARED_QUANTITIES = ("u", "v", "exx", "eyy", "exy")
-"""What is compared: displacement in mm and Green-Lagrange strain, along the axes of the simulation's mesh."""
 VARIANTS = ("nodes", "levelled")
 """The simulation as it is at its nodes, and put through the measurement."""
-_NODE_TOLERANCE = 1e-6
-"""Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
 _MIN_DEFORMATION = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
 
@@ -221,6 +216,9 @@ class Comparison:
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
         self.covariance = NodalCovariance.from_mesh(self.mesh, result.nodes)
+        self.nodes = SimulationNodes(
+            simulation=simulation, mesh=self.mesh, covariance=self.covariance, node_numbers=result.node_number
+        )
         units = placement if placement.camera is None else rectification_of(result, scale, "mm").units
         self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
@@ -229,7 +227,7 @@ class Comparison:
     @property
     def gauge(self) -> float:
         """Length of the virtual strain gauges, mm."""
-        return self._gauges[0].length
+        return self.nodes.gauges[0].length
 
     def iterate(self) -> Iterator[FrameComparison]:
         """Compare one frame after the other."""
@@ -253,10 +251,10 @@ class Comparison:
             measured = measured - rigid
         gradient = self.simulated_mesh.nodal_gradient(simulated)
         strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
-        values, nodal_std = self._at_nodes(measured, stated_std)
+        values, nodal_std = self.nodes.read(measured, stated_std)
         variants = {
             "nodes": (np.concatenate([simulated.T, strain.T]), nodal_std),
-            "levelled": (self._at_nodes(levelled, noise * [[[1]], [[0]]])[0], self._at_nodes(measured, noise)[1]),
+            "levelled": (self.nodes.read(levelled, noise * [[[1]], [[0]]])[0], self.nodes.read(measured, noise)[1]),
         }
         scale_std = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
         std = np.hypot(nodal_std[0], scale_std)
@@ -349,83 +347,6 @@ class Comparison:
         )
         return fit, np.tensordot(rigid, motions, 1), rigid_reduction
 
-    @cached_property
-    def _matching_nodes(self) -> IntArray:
-        """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
-
-        All are -1 where the measurement has nodes of its own.
-        """
-        points, numbers = self.simulation.mesh.points, self.result.node_number
-        nodes = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
-        if numbers is not None:
-            nodes = label_indices(numbers, self.simulation.mesh.node_numbers)
-        distance = np.abs(self.mesh.nodes[nodes] - points).max(axis=1)
-        nodes = np.where(distance < _NODE_TOLERANCE * self.mesh.size, nodes, -1)
-        return nodes if len(np.unique(nodes[nodes >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
-
-    @cached_property
-    def _simulation_points(self) -> MeshPoints:
-        """The simulation's nodes in the measurement's mesh."""
-        points = MeshPoints.of(self.mesh, self.simulation.mesh.points)
-        if not points.inside.any():
-            raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
-        return points
-
-    def _sampling_matrix(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
-        """Return the matrix (M, N) that reads nodes (N,) with data at the simulation's, and a mask (M,) of these."""
-        valid = np.ones(len(self.mesh.nodes), dtype=bool) if has_data is None else has_data
-        if (has_node := self._matching_nodes >= 0).any():
-            entries = np.ones(has_node.sum()), (np.flatnonzero(has_node), self._matching_nodes[has_node])
-            return sp.csr_matrix(entries, shape=(len(has_node), len(valid))), has_node & valid[self._matching_nodes]
-        return self._simulation_points.weights(valid), self._simulation_points.measured(valid)
-
-    @cached_property
-    def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
-        """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
-        sampling, is_inside = self._sampling_matrix()
-        if (self._matching_nodes >= 0).any():
-            return StrainGauges.at_nodes(self.covariance), sampling
-        gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[is_inside])
-        return gauges, sp.eye(len(is_inside), format="csr")[:, is_inside]
-
-    @cached_property
-    def _correlations(self) -> list[tuple[list[sp.csr_matrix], list[sp.csr_matrix]]]:
-        """Correlations C and K (M, M) between nodes of each of the `COMPARED_QUANTITIES`: of fit and lights' bias.
-
-        With them their products C C, 2 C K and K K, entry by entry.
-        """
-        sampling, (gauges, selection) = self._sampling_matrix()[0], self._gauges
-        x, y = (selection @ slope for slope in gauges.slopes)
-        correlations = []
-        for matrices in ([sampling], [x], [y], [x, y]):
-            relative = self.covariance.relative(matrices)
-            fit, bias = (sp.csr_matrix(root @ root.T) for root in (relative.fit, relative.bias))
-            products = [
-                sp.csr_matrix(product) for product in (fit.multiply(fit), 2 * fit.multiply(bias), bias.multiply(bias))
-            ]
-            correlations.append(([fit, bias], products))
-        return [correlations[0], *correlations]
-
-    def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
-        has_data = np.asarray(np.isfinite(displacement + noise[0]).all(axis=0))
-        sampling, is_measured = self._sampling_matrix(has_data)
-        values, *noise_std = np.full((3, len(COMPARED_QUANTITIES), len(is_measured)), np.nan)
-        (gauges, selection), bias = self._gauges, noise[1]
-        node, gauge = selection.nonzero()
-        noise_cases = [(noise_std[0], noise), (noise_std[1], np.stack([bias, bias]))]
-        noise_std[1][:] = 0.0
-        for std, stds in noise_cases if (bias > 0).any() else noise_cases[:1]:
-            for row, (component, *errors) in enumerate(zip(displacement, *stds, strict=True)):
-                factor = sampling @ self.covariance.factor(*np.where(has_data, errors, 0))
-                values[row] = np.where(is_measured, sampling @ np.where(has_data, component, 0), np.nan)
-                variance = np.asarray(factor.multiply(factor).sum(axis=1)).ravel()
-                std[row] = np.where(is_measured, np.sqrt(variance), np.nan)
-            strain = gauges.strain(Displacement(values=displacement, std=stds[0], bias=stds[1]))
-            for row, name in enumerate(("exx", "eyy", "exy"), start=2):
-                values[row, node], std[row, node] = strain[name].values[gauge], strain[name].uncertainty[gauge]
-        return values, np.stack(noise_std)
-
     def _agreement(
         self, rows: list[int], difference: FloatArray, noise_stds: FloatArray, common: FloatArray, fit_reduction: float
     ) -> Agreement:
@@ -446,7 +367,7 @@ class Comparison:
         square = float((common_noise**2).sum()) ** 2
         fit = np.sqrt(np.maximum(noise**2 - bias**2, 0))
         for row, fit_row, bias_row, common_row in zip(rows, fit, bias, common_noise, strict=True):
-            correlations, products = self._correlations[row]
+            correlations, products = self.nodes.correlations[row]
             weighted_products = [
                 (fit_row * fit_row, products[0]),
                 (fit_row * bias_row, products[1]),
@@ -489,7 +410,7 @@ def _match_times(
     if times is None:
         logger.warning("the frames of %s have no times: their numbers count as the simulation's times", result.path)
     start, end = simulation.times[[0, -1]]
-    slack = _NODE_TOLERANCE * max(abs(start), abs(end))
+    slack = NODE_TOLERANCE * max(abs(start), abs(end))
     frames_inside = [index for index in frames if start - slack <= clock[index] <= end + slack]
     frames_outside = tuple(index for index in frames if index not in frames_inside)
     if not frames_inside or (requested is not None and frames_outside):

@@ -15,7 +15,8 @@ import numpy as np
 from rgbmidic.errors import import_optional
 from rgbmidic.results.files import write_complete, write_errors, write_table
 from rgbmidic.text import format_with_std
-from rgbmidic.tools.finite_elements.comparison import COMPARED_QUANTITIES, VARIANTS, Comparison, FrameComparison
+from rgbmidic.tools.finite_elements.comparison import VARIANTS, Comparison, FrameComparison
+from rgbmidic.tools.finite_elements.simulation_nodes import COMPARED_QUANTITIES
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.figures import select_evenly
 from rgbmidic.tools.report.page import render

@@ -88,8 +88,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
             raise InputError(f"mesh file not found: {path}")
         content = reader(path)
     except RgbmidicError as error:
-        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except Exception as error:  # text that is no mesh may raise any, in meshio's readers above all
+        raise InputError(str(error) if str(path) in str(error) else f"{path} is not a readable mesh: {error}") from None
+    except Exception as error:  # the last resort: whatever a damaged file leads to is one line
         message = str(error) if isinstance(error, OSError) else str(error)[:120]  # the latter may quote the file
         raise InputError(f"{path} is not a readable mesh: {message or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
@@ -154,11 +154,11 @@ def _select_plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tupl
     """Return the axes of the plane that is measured, and its faces; the log states which, if there are others."""
     corners, nodes = points[faces], points[np.unique(faces)]
     area = np.linalg.norm(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]), axis=1) / 2
-    tolerance, curved = ROUNDING * float(np.ptp(nodes, axis=0).max()), np.ones(len(faces), dtype=bool)
+    tolerance, is_oblique = ROUNDING * float(np.ptp(nodes, axis=0).max()), np.ones(len(faces), dtype=bool)
     planes: list[tuple[float, int, float, IntArray]] = []
     for axis in range(3):
         in_plane = np.flatnonzero(np.ptp(corners[..., axis], axis=1) <= tolerance)
-        curved[in_plane] = False
+        is_oblique[in_plane] = False
         height = corners[in_plane, :, axis].mean(axis=1)
         order = np.argsort(height)
         groups = np.split(order, np.flatnonzero(np.diff(height[order]) > tolerance) + 1)
@@ -166,7 +166,7 @@ def _select_plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tupl
             (float(area[in_plane[g]].sum()), axis, float(height[g].mean()), in_plane[g]) for g in groups if len(g)
         ]
     largest = max((plane[0] for plane in planes), default=0.0)
-    if area[curved].sum() >= largest:
+    if area[is_oblique].sum() >= largest:
         centred = nodes - nodes.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
         deviation, tilt = float(np.abs(centred @ normal).max()), float(np.degrees(np.arccos(np.abs(normal).max())))

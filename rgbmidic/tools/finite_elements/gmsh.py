@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.tools.finite_elements.mesh_file import MeshContent, limit_size
+from rgbmidic.tools.finite_elements.mesh_file import MeshContent, limit_size, parse_real, parse_whole
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ _NODES = {
 _TYPES = {kind: (shape, count) for shape, kinds in _NODES.items() for kind, count in kinds.items()}
 _WORD = re.compile(rb'\s*("[^"\n]*"|\S+)[ \t]*\r?\n?')
 _HEADER = re.compile(rb"\$MeshFormat\s+(\S+)\s+([01])\s+8[ \t]*\r?\n")
-_NUMBERS = {"i": int, "q": int, "d": float}
+_NUMBERS = {"i": parse_whole, "q": parse_whole, "d": parse_real}
 
 
 def read_gmsh(path: Path) -> MeshContent:
@@ -239,7 +239,7 @@ def _read_word(source: _Source) -> str:
 
 def _read_int(source: _Source) -> int:
     """Return the next word, a whole number."""
-    return int(_read_word(source))
+    return parse_whole(_read_word(source))
 
 
 def _read_size(source: _Source) -> int:

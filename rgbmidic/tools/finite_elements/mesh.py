@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.triangles import cross, orient_elements
+from rgbmidic.mesh.triangles import as_values, cross, orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
@@ -75,6 +75,10 @@ class FiniteElementMesh:
         points, elements, area = orient_elements(self.points, self.elements, self.name)
         if not (area > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
             raise InputError(f"{self.name}: element {np.asarray(self.element_numbers)[area.argmin()]} has no area")
+        if self.axes not in ((0, 1), (0, 2), (1, 2)):
+            raise InputError(f"{self.name}: axes are two of 0, 1, 2 in their order, not {self.axes!r}")
+        for key, data in self.fields.items():
+            as_values(data, f"{self.name}: {key}", (len(points), *(None,) * (np.ndim(data) - 1)))
         for key, values, count in (
             ("points", points, len(points)),
             ("elements", elements, len(elements)),
@@ -98,6 +102,7 @@ class FiniteElementMesh:
         -------
         FiniteElementMesh
         """
+        selected = as_values(selected, "selected", (len(self.elements),), "b")
         used_nodes, index = np.unique(self.elements[selected], return_inverse=True)
         return replace(
             self,

@@ -83,6 +83,9 @@ class MeshContent:
         unread: Collection[str],
     ) -> Self:
         """Return the content of nodes (label, position) and elements (shape, label, labels of the nodes)."""
+        large = [label for label in (*(n for n, _ in nodes), *(n for _, n, _ in elements)) if abs(label) >= 2**63]
+        if large:
+            raise InputError(f"the label {large[0]} is too large")
         require_unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
         if invalid := [label for label, position in nodes if len(position) != 3]:
             raise InputError(f"node {invalid[0]} has not three coordinates")
@@ -107,9 +110,24 @@ def require_unique(noun: str, labels: IntArray) -> None:
         raise InputError(f"{noun} {values[count > 1][0]} is stated {count[count > 1][0]} times")
 
 
+def parse_whole(text: str) -> int:
+    """Return the value of a whole number in a file; anything else is refused."""
+    try:
+        return int(text.replace("_", "no digit"))
+    except ValueError:
+        raise InputError(f'"{text[:40]}" stands where a whole number is expected') from None
+
+
 def parse_real(text: str) -> float:
-    """Return value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
-    return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
+    """Return the value of a number as Fortran writes it too, with the exponent D or a sign alone; 0 of a blank."""
+    try:
+        return float(text.replace("_", "no digit") or 0)
+    except ValueError:
+        pass
+    try:
+        return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E").replace("_", "no digit")))
+    except ValueError:
+        raise InputError(f'"{text[:40]}" stands where a number is expected') from None
 
 
 def limit_size(path: Path) -> Path:

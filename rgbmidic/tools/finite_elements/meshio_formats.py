@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rgbmidic.errors import InputError, import_optional
+from rgbmidic.errors import InputError, RgbmidicError, import_optional
 from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, require_unique
 from rgbmidic.tools.finite_elements.vtu import NUMBERS, entity_labels
 from rgbmidic.typing import IntArray
@@ -27,6 +27,16 @@ FORMATS = {".vtk": "vtk", ".xdmf": "xdmf", ".mesh": "medit", ".avs": "avsucd", "
 
 def read_with_meshio(path: Path, kind: str) -> MeshContent:
     """Read a file of one of meshio's formats, and the labels that it leaves out."""
+    try:
+        return _read(path, kind)
+    except RgbmidicError:
+        raise
+    except Exception as error:  # text that is no mesh may raise any in meshio's readers
+        reason = f"{type(error).__name__} {' '.join(str(error).split())}".strip()
+        raise InputError(f"{path} is not a readable mesh: meshio ends with {reason[:120]}") from None
+
+
+def _read(path: Path, kind: str) -> MeshContent:
     reader = import_optional(f"meshio.{kind}", "fe")
     messages = io.StringIO()
     _check_limits(path, kind)

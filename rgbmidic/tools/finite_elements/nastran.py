@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MeshContent, parse_real, read_text
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MeshContent, parse_real, parse_whole, read_text
 
 _SHAPES = {
     **dict.fromkeys(("CTRIA3", "CTRIAR", "CTRIA6", "CPLSTN3", "CPLSTN6", "CPLSTS3", "CPLSTS6"), "triangle"),
@@ -31,11 +31,12 @@ def read_nastran(path: Path) -> MeshContent:
             if system not in ("", "0"):
                 raise InputError(f"{name} {label} has the coordinate system {system}: write nodes in the basic one")
             if name == "GRID":
-                nodes.append((int(label), [parse_real(x) for x in position]))
+                nodes.append((parse_whole(label), [parse_real(x) for x in position]))
         elif (shape := _SHAPES.get(name)) is not None:
             label, property_, *corners = fields
-            elements.append((shape, int(label), [int(node) for node in corners[: CORNERS[shape]]]))
-            sets.setdefault(property_ or label, []).append(int(label))
+            nodes_of_element = [parse_whole(node) for node in corners[: CORNERS[shape]]]
+            elements.append((shape, parse_whole(label), nodes_of_element))
+            sets.setdefault(property_ or label, []).append(parse_whole(label))
         elif name.startswith("C") and not name.startswith("CORD"):
             unread.add(name)
     return MeshContent.from_labels(nodes, elements, sets, unread)

@@ -18,6 +18,7 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.source import Plane
+from rgbmidic.mesh.triangles import as_values
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
 from rgbmidic.typing import FloatArray, as_numbers
@@ -54,6 +55,11 @@ class Placement(Plane):
     shift: FloatArray
     camera: Plane | None = None
     pairs: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        for name, shape in (("matrix", (2, 2)), ("shift", (2,)), ("pairs", (None, 4))):
+            as_values(getattr(self, name), f"{name} of a placement", shape)
 
     @classmethod
     def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, label: str = "mesh.points") -> Self:
@@ -159,15 +165,16 @@ class Placement(Plane):
         return float(self.mm_per_pixel * np.sqrt((self.residuals**2).sum() / free / spread))
 
     def to_px(self, points: FloatArray) -> FloatArray:  # noqa: D102
-        positions = points @ self.matrix.T + self.shift
+        positions = as_values(points, "points", (None, 2)) @ self.matrix.T + self.shift
         return positions if self.camera is None else self.camera.to_px(positions)
 
     def to_mm(self, points: FloatArray) -> FloatArray:  # noqa: D102
+        points = as_values(points, "points", (None, 2))
         positions = points if self.camera is None else self.camera.to_mm(points)
         return np.asarray((positions - self.shift) @ np.linalg.inv(self.matrix).T)
 
     def jacobian(self, points: FloatArray) -> FloatArray:  # noqa: D102
-        inverse = np.linalg.inv(self.matrix)
+        points, inverse = as_values(points, "points", (None, 2)), np.linalg.inv(self.matrix)
         if self.camera is None:
             return np.broadcast_to(inverse, (len(points), 2, 2)).copy()
         return np.asarray(inverse @ self.camera.jacobian(points))
@@ -185,7 +192,8 @@ class Placement(Plane):
         ndarray, shape (N, 2)
             In mm.
         """
-        return self.to_mm(points + vectors) - self.to_mm(points)
+        start = as_values(points, "points", (None, 2))
+        return self.to_mm(start + as_values(vectors, "vectors", start.shape)) - self.to_mm(start)
 
     def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
         """Return displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
@@ -200,7 +208,8 @@ class Placement(Plane):
         ndarray, shape (N, 2)
             In px.
         """
-        return self.to_px(points + vectors) - self.to_px(points)
+        start = as_values(points, "points", (None, 2))
+        return self.to_px(start + as_values(vectors, "vectors", start.shape)) - self.to_px(start)
 
     def to_document(self) -> dict[str, Any]:
         """Return all but the camera in plain values, as the provenance of a result holds it.

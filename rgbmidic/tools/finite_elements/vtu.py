@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size
+from rgbmidic.tools.finite_elements.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, parse_whole
 from rgbmidic.typing import AnyArray, IntArray
 
 NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
@@ -43,25 +43,30 @@ def read_vtu(path: Path) -> MeshContent:
     """Read the one piece of a file."""
     head, mark, tail = limit_size(path).read_bytes().partition(b"<AppendedData")
     encoding, _, appended = tail.partition(b"_")
-    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+    try:
+        root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+    except ElementTree.ParseError as error:
+        raise InputError(f"it is no XML: {error}") from None
     arrays = _Arrays(root, appended, b"raw" in encoding)
     if len(pieces := root.findall("UnstructuredGrid/Piece")) != 1:
-        raise ValueError(f"it has {len(pieces)} pieces of an unstructured grid: write it as one")
+        raise InputError(f"it has {len(pieces)} pieces of an unstructured grid: write it as one")
     data: list[dict[str, AnyArray]] = [
         {item.get("Name", ""): arrays.read(item) for item in pieces[0].iterfind(f"{section}/DataArray")}
         for section in ("Points", "PointData", "Cells", "CellData")
     ]
+    if len(data[0]) != 1 or not {"types", "offsets", "connectivity"} <= data[2].keys():
+        raise InputError("it needs one array of points, and types, offsets and connectivity of cells")
     (points,), point_data, cells, cell_data = data[0].values(), *data[1:]
     types, ends, nodes = (cells[name].ravel() for name in ("types", "offsets", "connectivity"))
-    counts = (int(pieces[0].get("NumberOfPoints", -1)), int(pieces[0].get("NumberOfCells", -1)))
-    if points.shape != (counts[0], 3) or not len(types) == len(ends) == counts[1]:
+    n_points, n_cells = (parse_whole(pieces[0].get(f"NumberOf{name}", "")) for name in ("Points", "Cells"))
+    if points.shape != (n_points, 3) or not len(types) == len(ends) == n_cells:
         raise InputError("its points and cells are not those that it announces")
     if not {ends.dtype.kind, nodes.dtype.kind} <= {"i", "u"}:
         raise InputError("its cells name their nodes by real numbers")
     width = np.diff(ends.astype(np.int64), prepend=0)
     if (width < 0).any() or width.sum() != len(nodes):
         raise InputError("the offsets of its cells are not those of its connectivity")
-    numbers, labels, numbering = entity_labels(point_data, cell_data, counts, 0)
+    numbers, labels, numbering = entity_labels(point_data, cell_data, (n_points, n_cells), 0)
     blocks, unread = [], set[str]()
     for kind in dict.fromkeys(types.tolist()):
         cell_indices = np.flatnonzero(types == kind)
@@ -117,6 +122,12 @@ class _Arrays:
 
     def read(self, item: ElementTree.Element) -> AnyArray:
         """Return the values of an array, (n,) or (n, components)."""
+        try:
+            return self._values(item)
+        except (ValueError, TypeError, OverflowError, zlib.error, lzma.LZMAError) as error:
+            raise InputError(f'its array "{item.get("Name", "")}" is not what it announces: {error}') from None
+
+    def _values(self, item: ElementTree.Element) -> AnyArray:
         kind = np.dtype(item.get("type", "").lower()).newbyteorder(self._order)
         form, text = item.get("format", "ascii"), (item.text or "").strip()
         if form == "ascii":

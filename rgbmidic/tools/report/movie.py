@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import InputError, ResultError, RgbmidicError, import_optional
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results import QUANTITIES, Maps, ResultQuantity, frame_times
@@ -26,7 +24,8 @@ from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.curves import Curve
 from rgbmidic.tools.report.figures import field_colours, picture_limits, select_evenly
-from rgbmidic.tools.report.video import PALETTE, Page, encode_video, write_gif
+from rgbmidic.tools.report.painter import OUTSIDE_GREY, ImageWindow, Overlay, pack, paint, palette, reference_picture
+from rgbmidic.tools.report.video import Page, encode_video, write_gif
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -53,13 +52,10 @@ class MovieConstants:
         spaced frames count.
     min_frames_per_process
         Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms.
-    outside_grey
-        Grey level outside the image, as in the viewer's light page.
     """
 
     sample_size: int = 4_000_000
     min_frames_per_process: int = 100
-    outside_grey: int = 235
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,14 +66,6 @@ class _Panel:
     colour_range: _Span
     colours: str
     extremes: FloatArray
-
-    def packed(self, solid: int) -> npt.NDArray[np.uint32]:
-        """Return the colours, so many 256ths of each, as `paint_field` takes them."""
-        from matplotlib import colormaps
-
-        shades = colormaps[self.colours](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T
-        red, green, blue = (255 * shades).astype(np.uint32) * np.uint32(solid) >> np.uint32(8)
-        return np.asarray(red | green << 8 | blue << 16 | np.uint32(0xFF000000))
 
 
 @state_new_names
@@ -196,16 +184,10 @@ class FieldMovie:
             finite_values = np.concatenate(colour_values)
             if not finite_values.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
-            colour_range, colours = (
-                self.stated_limits.get(name) or field.fixed_range or style.colour_range(finite_values),
-                self.colours,
-            )
+            limits = self.stated_limits.get(name) or field.fixed_range or style.colour_range(finite_values)
             extremes = np.array([finite_values.min(), finite_values.max()])
-            panels.append(
-                _Panel(
-                    field=field, colour_range=colour_range, colours=colours or field_colours(field), extremes=extremes
-                )
-            )
+            colours = self.colours or field_colours(field)
+            panels.append(_Panel(field=field, colour_range=limits, colours=colours, extremes=extremes))
         return tuple(panels), picture_limits(result, np.concatenate(corners))
 
 
@@ -324,37 +306,27 @@ class _Canvas:
         starts = np.ceil([(height - box.y1, box.x0) for box in boxes]).astype(int) + 1
         stops = np.array([(height - box.y0, box.x1) for box in boxes]).astype(int) - 1
         rows, columns = (stops - starts).min(axis=0).tolist()  # panels of one size, however their edges are rounded
-        self._size = rows, columns
-        self._boxes = [(slice(row, row + rows), slice(column, column + columns)) for row, column in starts.tolist()]
-        # px of the image to a pixel of a panel, and the place of its first pixel, as in the first panel
-        (row, column), box = starts[0].tolist(), boxes[0]
-        x_offset, y_offset = column + 0.5 - box.x0, row + 0.5 - (height - box.y1)
-        self._step = step = (x[1] - x[0]) / box.width
-        self._origin = x[0] + step * x_offset, y[0] + step * y_offset
-        solid = round(256 * movie.opacity)
-        self._grey_part, self._packed = 256 - solid, [panel.packed(solid) for panel in panels]
+        self.boxes = [(slice(row, row + rows), slice(column, column + columns)) for row, column in starts.tolist()]
+        # the part of the image that the pixels of the first panel show
+        step, (row, column), box = (x[1] - x[0]) / boxes[0].width, starts[0].tolist(), boxes[0]
+        x_min, y_min = x[0] + step * (column - box.x0), y[0] + step * (row - height + box.y1)
+        edges = {"x_min": x_min, "y_min": y_min, "x_max": x_min + step * columns, "y_max": y_min + step * rows}
+        self.window = ImageWindow(**edges, width=columns, height=rows)
         if self._times is not None:  # as many decimals in all frames: a text that changes its length jumps
             factor, unit = style.time_unit(self._times)
             interval = factor * np.nanmedian(np.diff(self._times)) if len(self._times) > 1 else 1.0
             self._clock = factor, unit, max(0, int(np.ceil(-np.log10(interval) - 1e-9)))
-        result = movie.maps.result
-        self._reference = np.full(self._size, movie.constants.outside_grey, dtype=np.uint8)
-        if result.reference is not None:
-            reference = result.reference.mean(axis=0).astype(np.uint8)
-            self._reference = self._resample_to_panel(reference, result.reference_origin)
-
-    def _resample_to_panel(self, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> npt.NDArray[np.uint8]:
-        """Resample an image, which begins at `origin`, as it lies in the panels."""
-        offset = self._origin[0] - origin[0], self._origin[1] - origin[1]
-        return style.resample(image, (self._step, self._step), offset, self._size, self.movie.constants.outside_grey)
+        self._reference = reference_picture(movie.maps.result, OUTSIDE_GREY[False])
 
     def mixtures(self) -> Iterator[Page]:
         """Yield for each panel its colours over all grey levels, as many pixels as a page has."""
         height, width = (int(length) for length in self.figure.bbox.size[::-1])
-        grey = np.linspace(0, 255, height).astype(np.uint32)[:, None] * np.uint32(self._grey_part) >> np.uint32(8)
-        for packed in self._packed:
-            mixed = packed[np.linspace(0, PALETTE - 1, width).astype(int)][None] + grey * np.uint32(0x010101)
-            yield mixed.astype(np.uint32).view(np.uint8).reshape(height, width, 4)
+        grey_part = round(256 * (1 - self.movie.opacity))
+        grey = np.linspace(0, 255, height).astype(np.uint32)[:, None] * np.uint32(grey_part) >> np.uint32(8)
+        for panel in self._panels:
+            colours = pack(palette(panel.colours), grey_part)
+            mixed = colours[np.linspace(0, len(colours) - 1, width).astype(int)] + grey * np.uint32(0x010101)
+            yield mixed.view(np.uint8).reshape(height, width, 4)
 
     def page(self, frame: int) -> Page:
         """Draw the page of a frame."""
@@ -373,20 +345,22 @@ class _Canvas:
             axis = self.figure.axes[-1]
             self._cursor.set_data([cursor_time, cursor_time], axis.get_ylim())
             axis.draw_artist(self._cursor)
-        page: npt.NDArray[np.uint32] = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
-        grey = self._reference if movie.images is None else self._resample_to_panel(movie.images(frame))
+        page = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
+        picture = self._reference if movie.images is None else movie.images(frame)
         nodes = result.nodes if movie.images is None else movie.maps.deformed_nodes(frame)
-        nodes = (nodes - self._origin) / self._step
-        for (rows, columns), field_panel, packed in zip(self._boxes, self._panels, self._packed, strict=True):
-            panel = np.empty(self._size, dtype=np.uint32)
-            nodal = movie.maps.read(field_panel.field.name, frame).values
-            vertices, elements = movie.maps.triangulate(field_panel.field, np.column_stack([nodes, nodal]))
-            x, y, values = np.ascontiguousarray(vertices.T)
-            paint_field(
-                panel, grey, x, y, elements, values, *map(float, field_panel.colour_range), packed, self._grey_part,
-                field_panel.field.stepped,
-            )  # fmt: skip
-            page[rows, columns] = panel
+        for box, panel in zip(self.boxes, self._panels, strict=True):
+            values = movie.maps.read(panel.field.name, frame).values
+            vertices, elements = movie.maps.triangulate(panel.field, np.column_stack([nodes, values]))
+            overlay = Overlay(
+                nodes=vertices[:, :2],
+                elements=elements,
+                values=np.ascontiguousarray(vertices[:, 2]),
+                colour_range=panel.colour_range,
+                colours=palette(panel.colours),
+                opacity=movie.opacity,
+                stepped=panel.field.stepped,
+            )
+            page[box] = paint(self.window, picture, overlay, OUTSIDE_GREY[False])
         return page.view(np.uint8).reshape(*page.shape, 4)
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.results.files import write_complete
@@ -228,33 +227,6 @@ def freeze_axes(figure: Figure, dpi: int) -> None:
         for image in axis.images:
             image.remove()
     figure.add_artist(Picture()).set_zorder(-1)
-
-
-def resample(
-    image: AnyArray,
-    step: tuple[float, float],
-    start: tuple[float, float],
-    size: tuple[int, int],
-    background: int,
-    *,
-    nearest: bool = False,
-) -> npt.NDArray[np.uint8]:
-    """Resample an image on `size` (rows, columns) pixels, `step` (x, y) px apart from the place `start` (x, y) on.
-
-    It is reduced by a whole factor first, against moiré; beyond it lies the grey level `background`.
-    """
-    import cv2
-
-    factor = max(1, int(min(step)))
-    small: AnyArray = np.asarray(image, dtype=np.uint8)
-    if factor > 1:
-        height, width = (length // factor * factor for length in small.shape)
-        reduced = (width // factor, height // factor)
-        small = cv2.resize(small[:height, :width], reduced, interpolation=cv2.INTER_AREA)
-    shift, (x_step, y_step), (x, y) = (factor - 1) / 2, step, start
-    to_image = np.array([[x_step, 0, x - shift], [0, y_step, y - shift]], dtype=np.float64) / factor
-    flags = (cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(small, to_image, size[::-1], flags=flags, borderValue=float(background)), np.uint8)
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:

@@ -19,9 +19,9 @@ from rgbmidic.results.histories import empty_histories, read_histories, with_cha
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.tools.report import history_figure
 from rgbmidic.tools.report.style import OKABE_ITO, time_axis, time_unit
+from rgbmidic.tools.view.canvas import columns, plain_plot
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.fields import FieldsInView
-from rgbmidic.tools.view.picture import columns, plain_plot
 from rgbmidic.tools.view.time_line import FRAME_MARK_STYLE
 from rgbmidic.tools.view.url_state import Mark, probe_marks, settings_of_marks
 from rgbmidic.tools.view.widgets import Background, ResultControls, warning
@@ -174,7 +174,7 @@ class CurvePanel:
         quantities = [] if self.histories is None else [quantity.name for quantity in self.histories.quantities]
         probe_quantities = [name for name in quantities if name not in names]
         for entry, blank_label, choices in (
-            ("trigger", "choose", names), ("align", "choose", names), ("force", "the one in N or kN", names),
+            ("trigger", "choose", names), ("align", "choose", names), ("force", "in N or kN", names),
             ("beside", "none", names), ("align_to", "choose", probe_quantities), ("along", "time", quantities),
         ):  # fmt: skip
             selected = getattr(view, entry)

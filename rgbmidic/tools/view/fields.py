@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import MEASURES, Area, Displacement, Field, Mean, make_probe
@@ -20,17 +21,10 @@ from rgbmidic.results.histories import convert_history
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.tools.report.figures import field_colours, select_evenly
-from rgbmidic.tools.report.style import time_text
+from rgbmidic.tools.report.painter import Overlay, Picture, palette, reference_picture
+from rgbmidic.tools.report.style import colour_range, ordinary_values, time_text
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.picture import (
-    Overlay,
-    Picture,
-    RawPictures,
-    element_at,
-    palette,
-    reference_picture,
-    robust_range,
-)
+from rgbmidic.tools.view.picture import RawPictures
 from rgbmidic.tools.view.url_state import EXTRA_FIELDS, UNCERTAINTY, ViewState
 from rgbmidic.tools.view.widgets import warning
 from rgbmidic.typing import AnyArray, FloatArray
@@ -57,6 +51,24 @@ def range_over_test(maps: Maps, name: str) -> tuple[float, float]:
     return (
         (min(low for low, _ in finite_ranges), max(high for _, high in finite_ranges)) if finite_ranges else (0.0, 1.0)
     )
+
+
+def element_at(
+    nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
+) -> tuple[npt.NDArray[np.int32], FloatArray] | None:
+    """Return the nodes (3,) of the element that holds a point, and their shape functions (3,); None outside."""
+    xs, ys = (nodes[elements] - (x, y)).transpose(2, 0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        areas = np.roll(xs, -1, axis=1) * np.roll(ys, 1, axis=1) - np.roll(xs, 1, axis=1) * np.roll(ys, -1, axis=1)
+        shape = areas / areas.sum(axis=1, keepdims=True)  # of the triangles between the place and the opposite sides
+        containing = np.flatnonzero(shape.min(axis=1) >= -1e-9)
+    return (elements[containing[0]], shape[containing[0]]) if len(containing) else None
+
+
+def robust_range(field_values: Field) -> tuple[float, float] | None:
+    """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
+    colour_values = ordinary_values(field_values.values, field_values.uncertainty)
+    return colour_range(colour_values) if colour_values.size else None
 
 
 class FieldsInView:

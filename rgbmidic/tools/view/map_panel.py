@@ -17,10 +17,11 @@ from bokeh.document import Document
 from bokeh.events import MouseMove
 
 from rgbmidic.results import frame_times
+from rgbmidic.tools.report.painter import OUTSIDE_GREY, ImageWindow, Picture, paint, palette
 from rgbmidic.tools.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, finish_picture, literal
+from rgbmidic.tools.view.canvas import Canvas, columns
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.fields import FieldsInView
-from rgbmidic.tools.view.picture import OUTSIDE_GREY, Canvas, ImageWindow, Picture, columns, element_at, paint, palette
+from rgbmidic.tools.view.fields import FieldsInView, element_at
 from rgbmidic.tools.view.url_state import MARKS, SCALE, Mark, probe_marks, probe_position
 from rgbmidic.typing import FloatArray
 
@@ -349,7 +350,7 @@ class MapPanel:
         def draw(axes: list[Axes]) -> None:
             for axis, name in zip(axes, names, strict=True):
                 overlay, field = fields.overlay(name), fields.maps.quantities[name]
-                pixels = paint(large, picture, overlay, OUTSIDE_GREY[False])
+                pixels = paint(large.limited(VIEWER.picture_pixels), picture, overlay, OUTSIDE_GREY[False])
                 edges = (window.x_min, window.x_max, window.y_max, window.y_min)
                 axis.imshow(pixels.view(np.uint8).reshape(*pixels.shape, 4), extent=edges)
                 limits = edges[:2], (window.y_min, window.y_max)
@@ -389,7 +390,8 @@ class MapPanel:
         self._arrange(len(names))
         for canvas, name in zip((self.canvas, *self.side_canvases), names, strict=False):
             field, overlay = fields.maps.quantities[name], fields.overlay(name)
-            canvas.show_picture(paint(window, picture, overlay, OUTSIDE_GREY[self._dark]), window)
+            pixels = paint(window.limited(VIEWER.picture_pixels), picture, overlay, OUTSIDE_GREY[self._dark])
+            canvas.show_picture(pixels, window)
             canvas.set_colour_bar(overlay.colour_range, overlay.colours, field.label, field.codes)
             canvas.number_axes(*fields.maps.physical.axes)
         return self._draw_layers(fields.nodes)

@@ -20,13 +20,13 @@ from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.report.style import data_url
+from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.curves import CurvePanel
 from rgbmidic.tools.view.fields import FieldsInView
 from rgbmidic.tools.view.line_panel import LinePanel
 from rgbmidic.tools.view.map_panel import MapPanel
 from rgbmidic.tools.view.panels import FileButtons, MovieButton, ProbeNames
-from rgbmidic.tools.view.picture import Canvas
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
 from rgbmidic.tools.view.url_state import BACKGROUNDS, EXTRA_FIELDS, SCALE, UNCERTAINTY, Mark, UndoHistory, ViewState
 from rgbmidic.tools.view.widgets import ResultControls, SharedState, call_periodically, run_guarded, script, warning

@@ -20,9 +20,10 @@ from rgbmidic.pipeline.plan import place_mesh, read_region
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
 from rgbmidic.tools.lab.inspection import Inspection
+from rgbmidic.tools.report.painter import OUTSIDE_GREY, Overlay, paint, palette
 from rgbmidic.tools.report.style import colour_range
+from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.picture import OUTSIDE_GREY, Canvas, Overlay, paint, palette
 from rgbmidic.tools.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 from rgbmidic.tools.view.test_file_editor import (
     SHAPES,
@@ -148,7 +149,10 @@ class SetupPage:
         raw, is_saturated = self.source.read_picture(index)
         picture_name = self.controls.picture.value
         picture = self.pictures.get(picture_name, raw)
-        overlay, window = self._expected if picture_name == _EXPECTED else None, self.canvas.window
+        overlay, window = (
+            self._expected if picture_name == _EXPECTED else None,
+            self.canvas.window.limited(VIEWER.picture_pixels),
+        )
         image = paint(window, picture, overlay, OUTSIDE_GREY[self.dark])
         if self.controls.glare.active:
             saturated = paint(window, is_saturated.astype(np.uint8) * 255, outside_grey=0)

@@ -29,9 +29,11 @@ from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.tools.lab.inspection import Inspection, inspect_frame
 from rgbmidic.tools.report.page import render
+from rgbmidic.tools.report.painter import Picture
 from rgbmidic.tools.report.style import OKABE_ITO
+from rgbmidic.tools.view.canvas import Canvas, columns
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.picture import Canvas, Picture, columns, grey_picture, stretch_to_uint8
+from rgbmidic.tools.view.picture import grey_picture, stretch_to_uint8
 from rgbmidic.tools.view.test_file_editor import HOLES, MASK, Draft, keep_one_outline, masks_of, rings
 from rgbmidic.tools.view.url_state import Mark, UndoHistory
 from rgbmidic.tools.view.widgets import Controls

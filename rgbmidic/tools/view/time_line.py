@@ -9,8 +9,8 @@ import numpy.typing as npt
 from rgbmidic.errors import ResultError
 from rgbmidic.results import Result
 from rgbmidic.tools.report.style import OKABE_ITO
+from rgbmidic.tools.view.canvas import columns, plain_plot
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.picture import columns, plain_plot
 from rgbmidic.typing import FloatArray
 
 _NOT_YET, _DAMAGED = -1, 3

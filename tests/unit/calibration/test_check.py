@@ -18,7 +18,8 @@ from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import block_means, stack_frames
-from rgbmidic_calibration.cli import app, read_limits
+from rgbmidic_calibration.cli import app
+from rgbmidic_calibration.options import read_limits
 from rgbmidic_calibration.verify import (
     Limits,
     additivity,

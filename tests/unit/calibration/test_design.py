@@ -9,7 +9,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.tools.scene.camera import MEASURED_CROSSTALK
 from rgbmidic.tools.scene.spectra import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, read_camera, read_lamp
-from rgbmidic_calibration.display import draw_design
+from rgbmidic_calibration.pictures import draw_design
 
 LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}
 OHNO = {name: Led(centre=lamp.centre, width=HALF_MAXIMUM * lamp.width) for name, lamp in LEDS.items()}

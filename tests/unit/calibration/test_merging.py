@@ -12,8 +12,8 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic_calibration.display import draw_calibration
 from rgbmidic_calibration.jobs import merge_files
+from rgbmidic_calibration.pictures import draw_calibration
 
 LIGHTS = ("red", "green", "blue")
 CAMERA = {"cfa": "RGGB", "black_level": 64.0, "white_level": 4095.0, "shape": (100, 120)}

@@ -8,6 +8,7 @@ import signal
 import struct
 import tracemalloc
 import zlib
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbmidic import FiniteElementMesh, read_mesh
-from rgbmidic.errors import InputError
+from rgbmidic import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
+from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.tools.finite_elements import mesh_file
 
 meshio = pytest.importorskip("meshio")
@@ -416,3 +417,52 @@ def test_overlaps_are_those_of_all_pairs() -> None:
         assert (both in pairs) if pairs else (both is None)
         found.append(bool(pairs))
     assert 0.2 < np.mean(found) < 0.98
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "a.inp",
+            INP.replace("6, 20.0", "6x, 20.0"),
+            'not a readable mesh: "6x" stands where a whole number is expected',
+        ),
+        ("a.inp", INP.replace("20.0, 10.0", "2_0, 10.0"), 'mesh: "2_0" stands where a number is expected'),
+        ("a.inp", INP.replace("type=CPS4", "tpe=CPS4"), r"mesh: \*ELEMENT has no TYPE"),
+        ("a.bdf", BDF.replace("GRID,6", "GRID,six"), 'mesh: "six" stands where a whole number'),
+        ("a.msh", MSH.replace("20.0", "20.0.0"), 'mesh: "20.0.0" stands where a number'),
+        ("a.vtu", "<VTKFile>", "mesh: it is no XML: no element found"),
+        ("a.avs", AVS.replace("quad", "quat"), "mesh: meshio ends with KeyError"),
+    ],
+)
+def test_a_word_in_place_of_a_number_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
+    refused(tmp_path, name, text, message)
+
+
+def test_methods_of_meshes_refuse_arrays_of_another_type_or_size() -> None:
+    mesh = FiniteElementMesh(
+        name="plate",
+        points=POINTS[:, :2],
+        node_numbers=np.arange(6),
+        elements=np.array([[0, 1, 4], [1, 2, 5]]),
+        element_numbers=np.array([1, 2]),
+    )
+    placement = Placement.fit([(0, 0, 100, 300), (10, 0, 200, 300)])
+    tri3 = Tri3Mesh(nodes=10 * mesh.points, elements=mesh.elements)
+    flags: Any = [True] * 5
+    for call, message in (
+        (lambda: mesh.subset(flags), r"selected must be an array \(2\) of True or False"),
+        (lambda: replace(mesh, fields={"U": np.ones(3)}), r"plate: U must be an array \(6\) of numbers"),
+        (lambda: placement.to_px("here"), r"points must be an array \(any, 2\) of numbers; given is 'here'"),
+        (lambda: placement.vectors_to_mm([[1, 2]], [[3]]), r"vectors must be an array \(1, 2\) of numbers"),
+        (lambda: Placement(matrix="x", shift=[1, 2]), r"matrix of a placement must be an array \(2, 2\)"),
+        (lambda: tri3.region("x"), "numbers of rows and columns"),
+        (lambda: tri3.submesh(flags), r"nodes must be an array \(6\) of True or False"),
+        (lambda: tri3.nearest_nodes(np.ones(5, dtype=bool)), r"targets must be an array \(6\)"),
+        (lambda: tri3.nearest_nodes(np.zeros(6, dtype=bool)), "one node at least"),
+        (lambda: tri3.to_nodes(np.ones(6)), r"per_element must be an array \(2\) of numbers"),
+        (lambda: tri3.nodal_gradient(np.ones(6)), r"values must be an array \(6, any\) of numbers"),
+        (lambda: Tri3Mesh.from_region("x", 20), "made of a Region"),
+    ):
+        with pytest.raises(RgbmidicError, match=message):
+            call()

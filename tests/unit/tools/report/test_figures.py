@@ -22,7 +22,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.tools.report import curves, figures, remove_pictures, save_figure, style, write_figures, write_maps
-from rgbmidic.tools.view.picture import reference_picture
+from rgbmidic.tools.report.painter import reference_picture
 from rgbmidic.typing import AnyArray
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))

@@ -55,11 +55,10 @@ def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
     from matplotlib import colormaps
 
     canvas = _Canvas(FieldMovie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
-    page, step, (left, top) = canvas.page(5), canvas._step, canvas._origin
-    rows, columns = canvas._boxes[0]
-    for x, y in ((30, 40), (60, 30), (95, 60)):
-        value = 0.01 * (x - 60)
-        at = page[rows.start + round((y - top) / step), columns.start + round((x - left) / step), :3] / 255
+    panel = canvas.page(5)[canvas.boxes[0]]
+    points = np.array([(30, 40), (60, 30), (95, 60)])
+    for x, column, row in zip(points[:, 0], *canvas.window.to_picture(points), strict=True):
+        value, at = 0.01 * (x - 60), panel[round(row), round(column), :3] / 255
         np.testing.assert_allclose(at, colormaps["viridis"](value + 0.5)[:3], atol=0.03)
 
 
@@ -77,7 +76,7 @@ def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
 
 @pytest.mark.parametrize("width", [601, 640, 727])
 def test_panels_have_one_size_however_their_edges_are_rounded(maps: Maps, width: int) -> None:
-    boxes = _Canvas(FieldMovie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width))._boxes
+    boxes = _Canvas(FieldMovie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width)).boxes
     assert len({(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes}) == 1
 
 
@@ -126,12 +125,10 @@ def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) ->
     maps = Maps.from_result(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
     grey = lambda index: np.full((80, 200), 100, dtype=np.uint8)  # noqa: E731
     canvas = _Canvas(FieldMovie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
-    step, (left, top) = canvas._step, canvas._origin
-    rows, columns = canvas._boxes[0]
-    page = canvas.page(1)[rows, columns]
-    grey_at = lambda x: np.ptp(page[round((40 - top) / step), round((x - left) / step), :3]) == 0  # noqa: E731
-    assert grey_at(25)  # where the mesh begins on the reference
-    assert not grey_at(135)  # beyond its end there
+    panel = canvas.page(1)[canvas.boxes[0]]
+    (begin, beyond), (row, _) = canvas.window.to_picture(np.array([(25, 40), (135, 40)]))
+    assert np.ptp(panel[round(row), round(begin), :3]) == 0  # where the mesh begins on the reference
+    assert np.ptp(panel[round(row), round(beyond), :3]) > 0  # beyond its end there
 
 
 def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from small_tests import grey_frame
 
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.settings import read_test
-from rgbmidic.tools.view.picture import Canvas
+from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.setup import SetupPage
 from rgbmidic.tools.view.setup_panel import DraftFrames, RegionDrawing
 from rgbmidic.tools.view.test_file_editor import Confirmation, Draft, region_of
@@ -76,6 +76,15 @@ def drawing_on(marks):
     canvas = Canvas(document, ("rectangle", "polygon", "hole"), (0, 0, 150, 120), lambda: None)
     drawing = RegionDrawing(document, canvas, marks, lambda: None)
     return drawing, Browser(canvas)
+
+
+def test_a_canvas_shows_what_was_asked_for_in_the_size_that_the_browser_reports():
+    canvas = Canvas(Document(), ("point",), (0, 0, 150, 120), lambda: None)
+    for name in ("inner_width", "inner_height"):
+        canvas.plot.set_from_json(name, 300)
+    assert (canvas.window.width, canvas.window.height) == (300, 300)
+    assert canvas.window.edges == (0, -15, 150, 135)
+    assert (canvas.plot.y_range.start, canvas.plot.y_range.end) == (135, -15)
 
 
 @pytest.mark.parametrize("answered", [0, 1, 2, 3])

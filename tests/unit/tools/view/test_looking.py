@@ -27,13 +27,13 @@ from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.text import format_value, format_with_std
+from rgbmidic.tools.report.painter import ImageWindow, Overlay, paint, palette
 from rgbmidic.tools.report.style import time_axis
 from rgbmidic.tools.view import curves
 from rgbmidic.tools.view.curves import CurvePanel
-from rgbmidic.tools.view.fields import FieldsInView, palette_name, range_over_test
+from rgbmidic.tools.view.fields import FieldsInView, element_at, palette_name, range_over_test, robust_range
 from rgbmidic.tools.view.map_panel import LabelLayer, arrow_lines, contour_lines, place_texts
 from rgbmidic.tools.view.page import ResultPage
-from rgbmidic.tools.view.picture import ImageWindow, Overlay, element_at, paint, palette, robust_range
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
 from rgbmidic.tools.view.url_state import (
     CLOCKS,
