@@ -11,7 +11,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
-from rgbmidic.tools.stereo.calibration_part import CalibrationPart
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart, covariance_of
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
 from rgbmidic.tools.stereo.surface import SurfaceGauges
@@ -116,14 +116,14 @@ class Shape:
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
-        calibration = CalibrationPart.of(pair, carried_mesh.left, shape, spread, axes)
+        calibration = CalibrationPart.of(pair, carried_mesh.left, shape, axes)
         return cls(
             pair=pair,
             carried_mesh=carried_mesh,
             triangulation=shape,
             axes=axes_in_space,
             points=points,
-            covariance=axes_in_space.covariance(shape.covariance) + calibration.shape_covariance,
+            covariance=axes_in_space.covariance(shape.covariance) + covariance_of(calibration.shape),
             gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
             calibration=calibration,
         )
@@ -154,8 +154,9 @@ class Shape:
         reference = triangulate(self.pair, *nodes, spread, weights)
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
         covariance = self.axes.covariance(deformed.covariance)
-        strain, normal = self.gauges.strain(displacement, covariance)
-        covariance = covariance + self.calibration.displacement_covariance(displacement)
+        errors = self.calibration.displacement(reference, deformed)
+        strain, normal = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
+        covariance = covariance + covariance_of(errors)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
