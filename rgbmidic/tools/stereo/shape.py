@@ -108,10 +108,9 @@ class Shape:
         InputError
             A node lies where a lens has no inverse or behind a camera, or axes and gauge are not possible.
         """
-        exact = np.full_like(carried_mesh.right_std, _EXACT)
-        spread = _diagonal(exact, np.maximum(carried_mesh.right_std, _EXACT))
+        spread = _diagonal(np.zeros_like(carried_mesh.right_std), carried_mesh.right_std)
         pixels = carried_mesh.left.nodes, carried_mesh.right.nodes
-        shape = triangulate(pair, *pixels, spread)
+        shape = triangulate(pair, *pixels, spread, _weights(spread))
         if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
@@ -146,8 +145,7 @@ class Shape:
             for end in ("", "_std")
         )
         spread = _diagonal(*stds)
-        floored = np.where(np.isfinite(spread), spread, 1.0) + _EXACT**2 * np.eye(4)
-        weights = np.asarray(np.linalg.inv(floored), dtype=np.float64)
+        weights = _weights(spread)
         nodes = self.carried_mesh.left.nodes, self.carried_mesh.right.nodes
         deformed = triangulate(self.pair, nodes[0] + displacements[0], nodes[1] + displacements[1], spread, weights)
         # with the same weights: the error of the shape is in both, and cancels in their difference
@@ -219,6 +217,12 @@ def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(Non
     """Read what `Shape.frame` needs of some nodes of a frame."""
     values = result.frame(frame).values
     return {name: np.asarray(values[name])[nodes] for name in ("u", "v", "u_std", "v_std", "node_status")}
+
+
+def _weights(covariance: FloatArray) -> FloatArray:
+    """Return the inverse of covariances (N, 4, 4), finite where a coordinate is exact or has no data."""
+    finite = np.where(np.isfinite(covariance), covariance, 1.0)
+    return np.asarray(np.linalg.inv(finite + _EXACT**2 * np.eye(4)), dtype=np.float64)
 
 
 def _diagonal(left: FloatArray, right: FloatArray) -> FloatArray:
