@@ -216,7 +216,7 @@ _STATE = {
 
 def scene() -> str:
     """Sections and keys of SCENE.toml."""
-    from rgbmidic.tools.scene.camera import Camera, Light
+    from rgbmidic.tools.scene.camera import Camera, Light, SecondCamera
     from rgbmidic.tools.scene.scene import BODIES, DatasetSettings, State
     from rgbmidic.tools.scene.surface import Finish, Surface
 
@@ -233,6 +233,7 @@ def scene() -> str:
         ),
         ("[[lights]]", Light, _LIGHT, ("spectrum",)),
         ("[camera]", Camera, _CAMERA, ()),
+        ("[camera.second]", SecondCamera, {}, ()),
         ("[[states]]", State, _STATE, ("displacement",)),
         ("[output]", DatasetSettings, {}, ()),
     ]

@@ -95,9 +95,10 @@ def virtual(
 ) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.tools.lab.virtual.dataset import write_dataset, write_stereo_dataset
+    from rgbmidic.tools.scene.scene import read_scene
 
     with progress_bar("rendering") as progress:
-        if stereo is None:
+        if stereo is None and read_scene(scene).second is None:
             write_dataset(scene, out, progress)
         else:
             write_stereo_dataset(scene, out, stereo, progress)
@@ -114,13 +115,16 @@ def plan(
     from rgbmidic.tools.lab import check_folder
     from rgbmidic.tools.lab import planning_report as planning
     from rgbmidic.tools.lab.planning import make_plan, propose_colours, propose_lamps
+    from rgbmidic.tools.lab.stereo_planning import STEREO_WORDS, stereo_outlooks, stereo_rows
     from rgbmidic.tools.scene.scene import read_scene
 
     check_folder(out, planning.FILES, overwrite=overwrite)
-    lamp_plan = make_plan(read_scene(scene))
+    experiment = read_scene(scene)
+    lamp_plan = make_plan(experiment)
+    stereo = stereo_outlooks(lamp_plan, experiment.second) if experiment.second else []
     motion = planning.out_of_plane_error(lamp_plan, distance)
     proposals = {"colours exchanged": propose_colours(lamp_plan), "lamps moved": propose_lamps(lamp_plan)}
-    planning.write_plan(lamp_plan, proposals, out, distance=distance, overwrite=overwrite)
+    planning.write_plan(lamp_plan, proposals, out, distance=distance, stereo=stereo, overwrite=overwrite)
     title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
     print_table(title, *planning.zone_rows(lamp_plan), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
@@ -130,6 +134,9 @@ def plan(
         print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:
         print("no better place was found for the lamps")
+    if stereo:
+        title = "two cameras: standard uncertainty to expect in the axes of the mean plane, um, over field and states"
+        print_table(title, *stereo_rows(stereo), STEREO_WORDS)
     noise_limit = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
     print(
         f"out-of-plane motion at {motion['stand_off_mm']:g} mm reads as strain, {motion['strain_per_mm']:.2e} per mm:"

@@ -164,6 +164,15 @@ def strike(folder):
     os.chdir(folder)  # the old one is gone
 
 
+def strike_panel(folder):
+    """Nothing but the scene of the panel, with every other state."""
+    scene = (folder / "examples/scenes/panel.toml").read_text(encoding="utf-8")
+    head, *states = scene.split("[[states]]\n")
+    strike(folder)
+    (folder / "impact.toml").unlink()
+    (folder / "panel.toml").write_text("[[states]]\n".join([head, *states[::2]]), encoding="utf-8")
+
+
 def see_twice(folder):
     """Frames of a plate and photographs of a target by two cameras; the file of the cameras is made on the page."""
     shutil.rmtree(folder / "my_result")
@@ -181,6 +190,7 @@ PREPARED = {
     "docs/how-to/movies.md": send_wave,
     "docs/how-to/stereo.md": see_twice,
     "docs/tutorials/impact.md": strike,
+    "docs/tutorials/panel.md": strike_panel,
 }
 """What the folder of a page lacks or has besides."""
 
@@ -237,6 +247,9 @@ def test_the_blocks_of_a_page_run_as_written(page, demo, tmp_path, monkeypatch, 
             pytest.fail(f"{page}: a block of language {language!r} neither runs nor says why: {text[:60]!r}")
     if page == "README.md":
         assert Path("python_result/provenance.json").is_file()
+    if page == "docs/tutorials/panel.md":
+        assert np.sqrt(np.nanmean(names["ratio"] ** 2)) == pytest.approx(1, abs=0.4)
+        assert names["true"].min() < -0.5
     if page == "calibration/README.md":
         noise = Calibration.read("noise.json").camera_noise
         assert (noise.linearity_error.value < 0.05).all()  # of a camera that is linear

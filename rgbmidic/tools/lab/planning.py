@@ -345,13 +345,13 @@ def _predict(
                 reflects=reflects,
                 clean=clean.sum(axis=0),
                 saturated=saturated,
-                forecast=instrument.forecast(reference, zones, _nodal_mean(trace_change(displacement), radius)),
+                forecast=instrument.forecast(reference, zones, nodal_mean(trace_change(displacement), radius)),
             )
         )
     return reference, tuple(outlooks)
 
 
-def _nodal_mean(values: FloatArray, radius: float) -> FloatArray:
+def nodal_mean(values: FloatArray, radius: float) -> FloatArray:
     """Return the mean (n, h, w) of the known values within about `radius` points: over the elements of a node."""
     is_finite = np.isfinite(values)
     total, weight = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.pipeline.resolution import rms
 from rgbmidic.tools.lab import format_number, schema_document, write_findings
 from rgbmidic.tools.lab.planning import LampPlan, Outlook
+from rgbmidic.tools.lab.stereo_planning import StereoOutlook, stereo_figures
 from rgbmidic.tools.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.tools.scene.scene import Scene
 from rgbmidic.tools.scene.zones import REFLECTS
@@ -27,7 +28,13 @@ FILES = ("plan.json", "plan.png")
 
 
 def write_plan(
-    plan: LampPlan, proposals: dict[str, LampPlan], out: Path, *, distance: float | None = None, overwrite: bool = False
+    plan: LampPlan,
+    proposals: dict[str, LampPlan],
+    out: Path,
+    *,
+    distance: float | None = None,
+    stereo: Sequence[StereoOutlook] = (),
+    overwrite: bool = False,
 ) -> None:
     """Write plan.json and plan.png.
 
@@ -41,6 +48,8 @@ def write_plan(
         Folder; made where it does not exist.
     distance
         Stand-off distance, mm; None: that of the scene.
+    stereo
+        What two cameras leave to expect, at several angles; empty: there is one.
     overwrite
         Whether a plan in the folder is replaced.
 
@@ -49,7 +58,7 @@ def write_plan(
     ResultError
         A plan is already there, or the folder cannot be written.
     """
-    figures, picture = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
+    figures, picture = plan_document(plan, proposals, distance, stereo), plan_figure(plan, proposals)
     write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
@@ -142,7 +151,12 @@ def out_of_plane_error(plan: LampPlan, distance: float | None = None) -> dict[st
     return to_plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
-def plan_document(plan: LampPlan, proposals: dict[str, LampPlan], distance: float | None = None) -> dict[str, Any]:
+def plan_document(
+    plan: LampPlan,
+    proposals: dict[str, LampPlan],
+    distance: float | None = None,
+    stereo: Sequence[StereoOutlook] = (),
+) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
     figures = {
         "field_px": plan.field,
@@ -152,6 +166,8 @@ def plan_document(plan: LampPlan, proposals: dict[str, LampPlan], distance: floa
         **_arrangement(plan),
         "proposals": {name: {"gain": better.gain, **_arrangement(better)} for name, better in proposals.items()},
     }
+    if stereo:
+        figures["stereo"] = to_plain(stereo_figures(stereo))
     return schema_document("plan", figures)
 
 

@@ -383,6 +383,31 @@ class Camera(SceneSection):
         return Registration(lights=names, parameters=parameters, centre=centre, radius=radius)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondCamera(SceneSection):
+    """A second camera before the same scene: it looks at where the first one's axis meets the body, from as far away.
+
+    Attributes
+    ----------
+    angle_deg
+        Angle between the two optical axes.
+    azimuth_deg
+        Direction in which it stands from the first camera: 0 to the right, 90 below.
+    roll_deg
+        By so much it is turned about its own optical axis.
+    shape
+        Rows and columns of its frame; None: as the first camera's.
+    focal_px
+        Its focal length, px; None: as the first camera's.
+    """
+
+    angle_deg: float = bounded(22.0, above=0, below=120)
+    azimuth_deg: float = 0.0
+    roll_deg: float = 0.0
+    shape: tuple[int, int] | None = bounded(None, at_least=2)
+    focal_px: float | None = bounded(None, above=0)
+
+
 def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     """Return RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
 

@@ -31,6 +31,7 @@ from rgbmidic.tools.scene.camera import (
     Camera,
     Light,
     Polarisers,
+    SecondCamera,
     Vector,
     rotation,
     three_lights,
@@ -375,19 +376,24 @@ class DatasetSettings(SceneSection):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """A scene, its states in order (the first frame of a data set is the body at rest), and settings of the output."""
+    """A scene, its states in order (the first frame of a data set is the body at rest), and settings of the output.
+
+    `second` is the second camera of a stereo test, None without.
+    """
 
     scene: Scene
     states: tuple[State, ...]
     output: DatasetSettings
+    second: SecondCamera | None = None
 
 
 def read_scene(path: Path | str) -> Experiment:
     """Read a SCENE.toml.
 
-    Sections: ``[body]``, ``[surface]`` with ``[surface.white]`` and ``[surface.black]``, ``[[lights]]``, ``[camera]``,
-    ``[polarisers]``, ``[[states]]`` and ``[output]``. Every one may be left out: the reference sphere, paint, lights
-    and camera stand in; polarisers are there where their section is, even an empty one.
+    Sections: ``[body]``, ``[surface]`` with ``[surface.white]`` and ``[surface.black]``, ``[[lights]]``, ``[camera]``
+    with ``[camera.second]``, ``[polarisers]``, ``[[states]]`` and ``[output]``. Every one may be left out: the
+    reference sphere, paint, lights and camera stand in; polarisers and a second camera are there where their section
+    is, even an empty one.
 
     Raises
     ------
@@ -410,12 +416,13 @@ def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     body: Body = read_section(BODIES[kind], "body", table, base)
     table, albedos = read_table(document, "surface"), {"white": 0.80, "black": 0.10}
     paints = {name: {"albedo": albedo, **read_table(table, name)} for name, albedo in albedos.items()}
-    lights = _tables(document, "lights")
+    lights, camera = _tables(document, "lights"), read_table(document, "camera")
+    second = camera.pop("second", None)
     scene = Scene(
         body=body,
         surface=read_section(Surface, "surface", {**table, **paints}, base),
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
-        camera=_camera(read_table(document, "camera"), body, base),
+        camera=_camera(camera, body, base),
     )
     if "polarisers" in document:
         scene = scene.polarised(read_section(Polarisers, "polarisers", read_table(document, "polarisers"), base))
@@ -423,6 +430,7 @@ def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
         scene=scene,
         states=tuple(_state(table, body, base) for table in _tables(document, "states")),
         output=read_section(DatasetSettings, "output", read_table(document, "output"), base),
+        second=None if second is None else read_section(SecondCamera, "camera.second", second, base),
     )
 
 

@@ -36,7 +36,7 @@ class Axes:
     description: str
 
     @classmethod
-    def of(cls, choice: AxesChoice, mesh: Tri3Mesh, points: FloatArray) -> Axes:
+    def of(cls, choice: AxesChoice, mesh: Tri3Mesh | None, points: FloatArray) -> Axes:
         """Lay axes through a surface.
 
         Parameters
@@ -47,7 +47,7 @@ class Axes:
             away from the cameras. Three points in px of the left reference: the origin, a point on the x axis, and one
             on the side of the plane z = 0 where y is positive.
         mesh
-            N nodes in px of the left frame.
+            N nodes in px of the left frame, for axes through three points; None: not needed.
         points : ndarray, shape (N, 3)
             The undeformed surface at the nodes, mm, left camera's axes.
 
@@ -71,6 +71,8 @@ class Axes:
             return cls._from(origin, np.array([1.0, 0.0, 0.0]), normal, "of the plane that fits the surface best")
         needed = "axes through points need three points (x, y) in px of the left reference"
         pixels = as_numbers(choice, needed, (3, 2), error=InputError)
+        if mesh is None:
+            raise InputError(f"{needed}, on its mesh")
         mesh_points = MeshPoints.of(mesh, pixels)
         mesh_points.check("a point of the axes")
         first, second, third = np.stack([mesh_points.read(values) for values in points.T], axis=1)

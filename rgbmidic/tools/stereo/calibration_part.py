@@ -1,4 +1,10 @@
-"""The uncertainty that the calibration of two cameras leaves in shape and displacement."""
+"""The uncertainty that the calibration of two cameras leaves in shape, displacement and strain.
+
+A point X is where both cameras project it: with other parameters p of the cameras, the same four image coordinates are
+those of ``X + dX``, ``dX = -G (dπ/dp) dp``, with the projection π and the derivative G of the point by its coordinates
+(`Triangulation.gain`). What a calibration error leaves in a displacement is the difference of dX of both states: it is
+zero where nothing moves.
+"""
 
 from __future__ import annotations
 
@@ -9,38 +15,42 @@ import numpy as np
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
-from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
+from rgbmidic.tools.stereo.triangulation import Triangulation
 from rgbmidic.typing import FloatArray
-
-_SAMPLED = 200
-"""Nodes over which the error of displacements is averaged: it is smooth over the frame (lens and pose)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CalibrationPart:
-    """Errors that 22 independent errors of unit variance of the calibration make, to first order.
+    """Errors that M independent errors of unit variance of the calibration make, to first order.
 
     Attributes
     ----------
-    shape : ndarray, shape (N, 3, 22)
-        Of the nodes on the undeformed surface, mm, in axes that are laid through the surface anew.
-    gain : ndarray, shape (3, 3, 22)
-        ``gain[i, j]``: of a displacement along i, per mm of displacement along j; the mean over the nodes.
+    pair
+        The cameras.
+    errors : ndarray, shape (22, M)
+        Of the parameters of the cameras; M is the rank of their covariance.
+    rotation : ndarray, shape (3, 3)
+        Of the axes.
+    turn : ndarray, shape (3, 3, M)
+        Of this rotation: the axes are laid through the surface, which has errors, too.
+    shape : ndarray, shape (N, 3, M)
+        Of the nodes on the undeformed surface, mm, in the axes.
     length_std : float
         Relative standard uncertainty of lengths on the surface.
     epipolar_std : float
         Standard uncertainty of the epipolar residual, px, rms over the nodes.
     """
 
+    pair: CameraPair
+    errors: FloatArray
+    rotation: FloatArray
+    turn: FloatArray
     shape: FloatArray
-    gain: FloatArray
     length_std: float
     epipolar_std: float
 
     @classmethod
-    def of(
-        cls, pair: CameraPair, mesh: Tri3Mesh, surface: Triangulation, spread: FloatArray, axes: AxesChoice
-    ) -> CalibrationPart:
+    def of(cls, pair: CameraPair, mesh: Tri3Mesh, surface: Triangulation, axes: AxesChoice) -> CalibrationPart:
         """Propagate the covariance of the cameras to a surface.
 
         Parameters
@@ -51,8 +61,6 @@ class CalibrationPart:
             N nodes in px of the left frame.
         surface
             The nodes in space.
-        spread : ndarray, shape (N, 4, 4)
-            Covariance of their coordinates in both frames, of which the weights follow.
         axes
             As of `Axes.of`.
 
@@ -60,58 +68,60 @@ class CalibrationPart:
         -------
         CalibrationPart
         """
-        nodes, count = pair.project(surface.points), len(mesh.nodes)
-        sampled = slice(None, None, count // _SAMPLED + 1)
-        rotation = Axes.of(axes, mesh, surface.points).rotation
-        length = 0.1 * float(np.linalg.norm(np.ptp(surface.points, axis=0)))  # any that is short against the distance
-        steps = [pair.project(surface.points[sampled] + length * direction) for direction in rotation]
-
-        def quantities(perturbed: CameraPair) -> FloatArray:
-            """Return nodes (3 N,), displacements (9,), the logarithm of the extent, and epipolar residuals."""
-            perturbed_surface = triangulate(perturbed, *nodes, spread)
-            turned = Axes.of(axes, mesh, perturbed_surface.points)
-            extent = np.linalg.norm(perturbed_surface.points - perturbed_surface.points.mean(axis=0))
-            motions = [
-                (
-                    (triangulate(perturbed, *pixels, spread[sampled]).points - perturbed_surface.points[sampled])
-                    @ turned.rotation.T
-                )
-                for pixels in steps
-            ]
-            gain = np.stack([displacement.mean(axis=0) / length for displacement in motions], axis=1)
-            return np.concatenate(
-                [
-                    turned.points(perturbed_surface.points).ravel(),
-                    gain.ravel(),
-                    [np.log(extent)],
-                    perturbed_surface.residual,
-                ]
-            )
-
-        errors = pair.sensitivity(quantities)
+        errors, points = pair.parameter_errors, surface.points
+        slopes = pair.parameter_slopes(points) @ errors
+        shift = -surface.gain @ slopes
+        at_rest = Axes.of(axes, mesh, points)
+        moved = [[Axes.of(axes, mesh, points + sign * step) for sign in (1, -1)] for step in np.moveaxis(shift, 2, 0)]
+        turn, origin = (
+            np.array([(getattr(plus, name) - getattr(minus, name)) / 2 for plus, minus in moved]).reshape(-1, *size)
+            for name, size in (("rotation", (3, 3)), ("origin", (3,)))
+        )
+        turn, origin = np.moveaxis(turn, 0, 2), origin.T
+        shape = np.einsum("ij,njm->nim", at_rest.rotation, shift - origin)
+        shape += np.einsum("ijm,nj->nim", turn, points - at_rest.origin)
+        centred = points - points.mean(axis=0)
+        growth = np.einsum("nj,njm->m", centred, shift) / (centred**2).sum()
+        epipolar = np.einsum("ni,nim->nm", surface.epipolar, slopes)
         return cls(
-            shape=errors[: 3 * count].reshape(count, 3, -1),
-            gain=errors[3 * count : 3 * count + 9].reshape(3, 3, -1),
-            length_std=float(np.linalg.norm(errors[3 * count + 9])),
-            epipolar_std=float(np.sqrt((errors[3 * count + 10 :] ** 2).sum(axis=1).mean())),
+            pair=pair,
+            errors=errors,
+            rotation=at_rest.rotation,
+            turn=turn,
+            shape=shape,
+            length_std=float(np.linalg.norm(growth)),
+            epipolar_std=float(np.sqrt((epipolar**2).sum(axis=1).mean())),
         )
 
-    @property
-    def shape_covariance(self) -> FloatArray:
-        """Covariance (N, 3, 3) of each node of the surface, mm^2."""
-        return np.asarray(self.shape @ self.shape.transpose(0, 2, 1))
-
-    def displacement_covariance(self, displacement: FloatArray) -> FloatArray:
-        """Return the covariance (N, 3, 3) of displacements (N, 3), mm^2.
+    def displacement(self, reference: Triangulation, deformed: Triangulation) -> FloatArray:
+        """Return the errors (N, 3, M) of displacements, mm, in the axes.
 
         Parameters
         ----------
-        displacement : ndarray, shape (N, 3)
-            mm, in the axes of the result.
+        reference, deformed
+            The nodes in both states, triangulated with the same weights.
 
         Returns
         -------
-        ndarray, shape (N, 3, 3)
+        ndarray, shape (N, 3, M)
         """
-        errors = np.einsum("ijk,nj->nik", self.gain, displacement)
-        return np.asarray(errors @ errors.transpose(0, 2, 1))
+        before, after = (
+            -state.gain @ (self.pair.parameter_slopes(state.points) @ self.errors) for state in (reference, deformed)
+        )
+        turned = np.einsum("ijm,nj->nim", self.turn, deformed.points - reference.points)
+        return np.asarray(np.einsum("ij,njm->nim", self.rotation, after - before) + turned)
+
+
+def covariance_of(errors: FloatArray) -> FloatArray:
+    """Return the covariance (N, 3, 3) that errors (N, 3, M) of unit variance make.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (N, 3, M)
+        Independent ones.
+
+    Returns
+    -------
+    ndarray, shape (N, 3, 3)
+    """
+    return np.asarray(errors @ errors.transpose(0, 2, 1))

@@ -7,7 +7,7 @@ rows of its frame, y down the columns, z along the optical axis, away from the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -124,32 +124,46 @@ class CameraPair:
         left, right = replace(self.left, lens=values[:8]), replace(self.right, lens=values[8:16])
         return replace(self, left=left, right=right, rotation=values[16:19], translation=values[19:])
 
-    def sensitivity(self, function: Callable[[Self], FloatArray]) -> FloatArray:
-        """Errors (..., 22) of a function of the pair that independent errors of unit variance of the parameters make.
+    @property
+    def parameter_errors(self) -> FloatArray:
+        """M independent errors (22, M) of unit variance of the parameters, which make up the covariance.
 
-        Their sum of squares is the variance that the calibration leaves.
-
-        Parameters
-        ----------
-        function
-            From a pair to an array (...).
-
-        Returns
-        -------
-        ndarray, shape (..., 22)
+        M is the rank of the covariance.
         """
-        values, scale = self.parameters, np.sqrt(np.diag(self.covariance))
+        scale = np.sqrt(np.diag(self.covariance))
         product = np.outer(scale, scale)
         relative = np.divide(self.covariance, product, out=np.zeros_like(product), where=product > 0)
         variances, vectors = np.linalg.eigh(relative)
-        at_rest = function(self)
-        slopes = [
-            (function(self.with_parameters(values + step)) - function(self.with_parameters(values - step))) / 2
-            if step.any()
-            else np.zeros_like(at_rest)
-            for step in np.diag(scale)
-        ]
-        return np.asarray(np.stack(slopes, axis=-1) @ vectors * np.sqrt(np.maximum(variances, 0)))
+        variances[variances < 1e-12] = 0.0  # rounding
+        return np.asarray((scale[:, None] * vectors * np.sqrt(variances))[:, variances > 0])
+
+    def parameter_slopes(self, points: FloatArray) -> FloatArray:
+        """Return the derivative (N, 4, 22) of the coordinates in the left and the right frame by the parameters.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            In mm, left camera's axes.
+
+        Returns
+        -------
+        ndarray, shape (N, 4, 22)
+        """
+        slopes = np.zeros((len(points), 4, _COUNT))
+        for side, (camera, pose) in enumerate(
+            zip(self.cameras, ((np.zeros(3), np.zeros(3)), (self.rotation, self.translation)), strict=True)
+        ):
+            lens = camera.lens
+            assert lens is not None
+            matrix = np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1.0]])
+            by_all = cv2.projectPoints(np.ascontiguousarray(points), *pose, matrix, lens[3:])[1]
+            by_all = np.asarray(by_all).reshape(len(points), 2, -1)
+            rows, first = slice(2 * side, 2 * side + 2), 8 * side
+            slopes[:, rows, first] = by_all[..., 6] + by_all[..., 7]
+            slopes[:, rows, first + 1 : first + 8] = by_all[..., 8:15]
+            if side:
+                slopes[:, rows, 16:] = by_all[..., :6]
+        return slopes
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points are seen by the left and by the right camera.

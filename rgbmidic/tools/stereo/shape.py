@@ -11,7 +11,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
-from rgbmidic.tools.stereo.calibration_part import CalibrationPart
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart, covariance_of
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
 from rgbmidic.tools.stereo.surface import SurfaceGauges
@@ -108,22 +108,21 @@ class Shape:
         InputError
             A node lies where a lens has no inverse or behind a camera, or axes and gauge are not possible.
         """
-        exact = np.full_like(carried_mesh.right_std, _EXACT)
-        spread = _diagonal(exact, np.maximum(carried_mesh.right_std, _EXACT))
+        spread = _diagonal(np.zeros_like(carried_mesh.right_std), carried_mesh.right_std)
         pixels = carried_mesh.left.nodes, carried_mesh.right.nodes
-        shape = triangulate(pair, *pixels, spread)
+        shape = triangulate(pair, *pixels, spread, _weights(spread))
         if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
-        calibration = CalibrationPart.of(pair, carried_mesh.left, shape, spread, axes)
+        calibration = CalibrationPart.of(pair, carried_mesh.left, shape, axes)
         return cls(
             pair=pair,
             carried_mesh=carried_mesh,
             triangulation=shape,
             axes=axes_in_space,
             points=points,
-            covariance=axes_in_space.covariance(shape.covariance) + calibration.shape_covariance,
+            covariance=axes_in_space.covariance(shape.covariance) + covariance_of(calibration.shape),
             gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
             calibration=calibration,
         )
@@ -146,16 +145,16 @@ class Shape:
             for end in ("", "_std")
         )
         spread = _diagonal(*stds)
-        floored = np.where(np.isfinite(spread), spread, 1.0) + _EXACT**2 * np.eye(4)
-        weights = np.asarray(np.linalg.inv(floored), dtype=np.float64)
+        weights = _weights(spread)
         nodes = self.carried_mesh.left.nodes, self.carried_mesh.right.nodes
         deformed = triangulate(self.pair, nodes[0] + displacements[0], nodes[1] + displacements[1], spread, weights)
         # with the same weights: the error of the shape is in both, and cancels in their difference
         reference = triangulate(self.pair, *nodes, spread, weights)
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
         covariance = self.axes.covariance(deformed.covariance)
-        strain, normal = self.gauges.strain(displacement, covariance)
-        covariance = covariance + self.calibration.displacement_covariance(displacement)
+        errors = self.calibration.displacement(reference, deformed)
+        strain, normal = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
+        covariance = covariance + covariance_of(errors)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
@@ -213,6 +212,12 @@ def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(Non
     """Read what `Shape.frame` needs of some nodes of a frame."""
     values = result.frame(frame).values
     return {name: np.asarray(values[name])[nodes] for name in ("u", "v", "u_std", "v_std", "node_status")}
+
+
+def _weights(covariance: FloatArray) -> FloatArray:
+    """Return the inverse of covariances (N, 4, 4), finite where a coordinate is exact or has no data."""
+    finite = np.where(np.isfinite(covariance), covariance, 1.0)
+    return np.asarray(np.linalg.inv(finite + _EXACT**2 * np.eye(4)), dtype=np.float64)
 
 
 def _diagonal(left: FloatArray, right: FloatArray) -> FloatArray:

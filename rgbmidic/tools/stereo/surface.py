@@ -61,7 +61,9 @@ class SurfaceGauges:
         gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh), length)
         return cls(gauges=gauges, points=points, measure=measure)
 
-    def strain(self, displacement: FloatArray, covariance: FloatArray) -> tuple[Strain, FloatArray]:
+    def strain(
+        self, displacement: FloatArray, covariance: FloatArray, errors: tuple[FloatArray, FloatArray] | None = None
+    ) -> tuple[Strain, FloatArray]:
         """Compute strain of the surface and the normal of the deformed one.
 
         Parameters
@@ -69,8 +71,11 @@ class SurfaceGauges:
         displacement : ndarray, shape (N, 3)
             mm; NaN where a node has no data.
         covariance : ndarray, shape (N, 3, 3)
-            Of the displacement, mm^2. The uncertainty of the undeformed shape changes strain by its relative error,
-            which is left out.
+            Of the displacement by the match, mm^2; nodes are independent. The match's error of the undeformed shape
+            changes strain by its relative error, which is left out.
+        errors : two of ndarray, shape (N, 3, M), optional
+            Errors of the undeformed surface and of the displacement that M independent errors of unit variance of the
+            calibration make, mm: all nodes have them together. None: the cameras are exact.
 
         Returns
         -------
@@ -89,9 +94,13 @@ class SurfaceGauges:
         def total(values: FloatArray) -> FloatArray:
             return np.asarray(np.add.reduceat(values, gauges.starts[:-1], axis=0))
 
-        tangents, slopes = (  # (G, 3, 2)
-            total(weights.T[:, None] * nodal[gauges.nodes][..., None]) for nodal in (self.points, fields)
-        )
+        def fit(nodal: FloatArray) -> FloatArray:
+            """Return the slopes (G, ..., 2) of fields (N, ...)."""
+            flat = nodal.reshape(len(nodal), -1)
+            sums = total(weights.T[:, None] * flat[gauges.nodes][..., None])
+            return sums.reshape(len(sums), *nodal.shape[1:], 2)
+
+        tangents, slopes = fit(self.points), fit(fields)  # (G, 3, 2)
         products = weights[[0, 0, 1, 1]] * weights[[0, 1, 0, 1]]
         inflation = gauges.inflation[:, [0, 2, 2, 1]]
         sums = total(products.T[..., None, None] * spread[gauges.nodes][:, None]) * inflation[..., None, None]
@@ -102,7 +111,8 @@ class SurfaceGauges:
         flat = np.eye(3)[:, :2]
         tangents, slopes = (np.where(valid[:, None, None], array, flat) for array in (tangents, slopes))
         deformed = tangents + slopes
-        to_axes = np.linalg.inv(_tangent_axes(tangents).transpose(0, 2, 1) @ tangents)
+        axes = _tangent_axes(tangents)
+        to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
         gradient = deformed @ to_axes
         left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
         turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
@@ -110,6 +120,14 @@ class SurfaceGauges:
             "gai,gdb,gidje,gcj,gef->gabcf", turn, to_axes, of_slopes, turn, to_axes, optimize=True
         )
         in_plane = turn @ gradient - np.eye(2)
+        # by the calibration: dF = dB M + B dM with dM = -M (T^T dA) M
+        tangent_errors, slope_errors = (
+            np.moveaxis(fit(np.where(measured[:, None, None], nodal, 0.0)), 2, 0)
+            for nodal in errors or (np.zeros((len(fields), 3, 0)),) * 2
+        )  # (M, G, 3, 2)
+        of_gradient = tangent_errors + slope_errors - gradient @ (axes.transpose(0, 2, 1) @ tangent_errors)
+        together = turn @ (of_gradient @ to_axes)
+        spread_in_plane += np.einsum("mgac,mgbd->gacbd", together, together)
         in_plane[~valid] = np.nan
         spread_in_plane[~valid] = np.nan
         normal = np.cross(deformed[:, :, 0], deformed[:, :, 1])

@@ -25,7 +25,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.plane_samples import Frame
 from rgbmidic.results.files import write_errors
 from rgbmidic.tools.lab.virtual.rendering import render
-from rgbmidic.tools.scene.camera import Camera, Light, green_signs, mosaic_samples
+from rgbmidic.tools.scene.camera import Camera, Light, SecondCamera, green_signs, mosaic_samples
 from rgbmidic.tools.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.tools.scene.surface import Finish, Surface
 from rgbmidic.tools.scene.zones import region_in_view, truth
@@ -75,11 +75,11 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: ProgressCal
 
 
 def write_stereo_dataset(
-    scene_toml: Path | str, out: Path | str, angle_deg: float, progress: ProgressCallback | None = None
+    scene_toml: Path | str, out: Path | str, angle_deg: float | None = None, progress: ProgressCallback | None = None
 ) -> tuple[Path, Path]:
     """Render the virtual test of a SCENE.toml as two cameras see it, for `rgbmidic stereo`.
 
-    Both cameras stand on a circle about the vertical through the body's front point, as far as the scene's camera.
+    The scene's camera is the left one, ``[camera.second]`` the right one.
     Written to `out`: ``left/`` and ``right/`` with all that `write_dataset` writes, ``stereo.json`` (the true cameras),
     and ``truth.npz`` (points (3, H, W) and displacement (T, 3, H, W), mm in the left camera's axes, of the material
     points at the pixels of the left frame 0; NaN where there is none).
@@ -89,7 +89,7 @@ def write_stereo_dataset(
     scene_toml, out, progress
         As of `write_dataset`.
     angle_deg
-        Angle between the cameras, half of it on either side of the scene's camera.
+        Angle between the cameras; None: as the scene states, or else its default.
 
     Returns
     -------
@@ -107,22 +107,23 @@ def write_stereo_dataset(
     """
     from rgbmidic.tools.lab.virtual.view_point import ViewPoint, true_motion, true_pair
 
-    if not 0 < angle_deg < 120:
-        raise InputError(f"cameras stand 0 to 120 degrees apart, not {angle_deg:g}")
     experiment, out = read_scene(scene_toml), Path(out)
+    second = experiment.second or SecondCamera()
+    if angle_deg is not None:
+        second = replace(second, angle_deg=angle_deg)
     scene, states = experiment.scene, (State(), *experiment.states)
-    views = ViewPoint.around(scene, angle_deg / 2), ViewPoint.around(scene, -angle_deg / 2)
+    views = ViewPoint.both(scene, second)
     poses = [[view.state(scene.body, state) for state in states] for view in views]
     _check_output(scene, out)
-    height, width = scene.camera.shape
-    whole_frame = replace(experiment.output, region=(0.0, 0.0, width - 1.0, height - 1.0))
     tests = list[Path]()
     for side, view, seen in zip(("left", "right"), views, poses, strict=True):
-        settings = replace(
-            experiment.output if side == "left" else whole_frame, seed=experiment.output.seed + len(tests)
-        )
+        settings = replace(experiment.output, seed=experiment.output.seed + len(tests))
+        if side == "right":
+            height, width = view.camera.shape
+            settings = replace(settings, region=(0.0, 0.0, width - 1.0, height - 1.0))
         (out / side).mkdir()
         tests.append(_write_test(view.scene(scene), seen, settings, out / side, progress))
+    height, width = scene.camera.shape
     pixels = np.indices(scene.camera.shape, dtype=float)[::-1].reshape(2, -1).T
     motions = [true_motion(scene, views[0], pixels, state) for state in states]
     points, displacement = motions[0][0], np.stack([motion for _, motion in motions])

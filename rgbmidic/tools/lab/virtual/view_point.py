@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.tools.scene.camera import Vector, rotation
+from rgbmidic.tools.scene.camera import Camera, SecondCamera, Vector, rotation
 from rgbmidic.tools.scene.scene import Body, Scene, State
 from rgbmidic.tools.scene.zones import material_points, points_and_normals
 from rgbmidic.tools.stereo import CameraPair
@@ -19,39 +20,67 @@ from rgbmidic.typing import AnyArray, FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewPoint:
-    """The place of a camera: it sees a point p of the scene's axes at ``rotation p + translation``.
+    """A camera and its place: it sees a point p of the scene's axes at ``rotation p + translation``.
 
     Attributes
     ----------
+    camera
+        The camera.
     rotation : ndarray, shape (3, 3)
         From the scene's axes to the camera's.
     translation : ndarray, shape (3,)
         mm.
     """
 
+    camera: Camera
     rotation: FloatArray
     translation: FloatArray
 
     @classmethod
-    def around(cls, scene: Scene, angle_deg: float) -> Self:
-        """Place a camera on a circle about the vertical through the body's front point, at the scene camera's distance.
+    def around(cls, scene: Scene, angle_deg: float, azimuth_deg: float = 0.0, roll_deg: float = 0.0) -> Self:
+        """Place the scene's camera elsewhere on a sphere, about the point of its axis as deep as the body's front.
 
         Parameters
         ----------
         scene
             The scene.
         angle_deg
-            Angle from the scene's camera, positive to its right.
+            Angle from the scene's camera.
+        azimuth_deg
+            Direction in which it stands from there: 0 to the right, 90 below.
+        roll_deg
+            Turn about its own axis.
 
         Returns
         -------
         ViewPoint
         """
-        turn, pivot = rotation(angle_deg, (0.0, 1.0, 0.0)), np.array([0.0, 0.0, scene.body.front[2]])
-        return cls(rotation=turn, translation=pivot - turn @ pivot)
+        azimuth, pivot = math.radians(azimuth_deg), np.array([0.0, 0.0, scene.body.front[2]])
+        turn = rotation(angle_deg, (-math.sin(azimuth), math.cos(azimuth), 0.0))
+        turn = rotation(roll_deg, (0.0, 0.0, 1.0)) @ turn
+        return cls(camera=scene.camera, rotation=turn, translation=pivot - turn @ pivot)
+
+    @classmethod
+    def both(cls, scene: Scene, second: SecondCamera) -> tuple[Self, Self]:
+        """Return the scene's camera where it is, the left one, and the second camera, the right one.
+
+        Parameters
+        ----------
+        scene
+            The scene.
+        second
+            How the second camera stands.
+
+        Returns
+        -------
+        left, right : ViewPoint
+        """
+        right = cls.around(scene, second.angle_deg, second.azimuth_deg, second.roll_deg)
+        changes = {name: value for name in ("shape", "focal_px") if (value := getattr(second, name)) is not None}
+        return cls.around(scene, 0.0), replace(right, camera=replace(scene.camera, **changes))
 
     def scene(self, scene: Scene) -> Scene:
-        """Return the scene with the lamps in this camera's axes; its body needs the states of `state`.
+        """Return the scene as this camera has it: the lamps in its axes. The body needs the states of `state`.
 
         Parameters
         ----------
@@ -64,7 +93,8 @@ class ViewPoint:
         """
         positions = [self.rotation @ np.array(light.position) + self.translation for light in scene.lights]
         lights = zip(scene.lights, positions, strict=True)
-        return replace(scene, lights=tuple(replace(light, position=_vector(place)) for light, place in lights))
+        moved = tuple(replace(light, position=_vector(place)) for light, place in lights)
+        return replace(scene, camera=self.camera, lights=moved)
 
     def state(self, body: Body, state: State | None = None) -> State:
         """Return a state of the body in this camera's axes.
@@ -112,20 +142,26 @@ def true_pair(scene: Scene, left: ViewPoint, right: ViewPoint) -> CameraPair:
     Parameters
     ----------
     scene
-        The scene; both cameras are its camera.
+        The scene.
     left, right
-        Where they stand.
+        The cameras.
 
     Returns
     -------
     CameraPair
     """
-    lens = np.r_[scene.camera.lenses(scene.lights)[0], np.zeros(5)]
-    camera = CameraCalibration(shape=scene.camera.shape, lens=lens, details={"first_light": scene.lights[0].name})
+    first, second = (
+        CameraCalibration(
+            shape=view.camera.shape,
+            lens=np.r_[view.camera.lenses(scene.lights)[0], np.zeros(5)],
+            details={"first_light": scene.lights[0].name},
+        )
+        for view in (left, right)
+    )
     turn = right.rotation @ left.rotation.T
     return CameraPair(
-        left=camera,
-        right=camera,
+        left=first,
+        right=second,
         rotation=np.ravel(cv2.Rodrigues(turn)[0]),
         translation=right.translation - turn @ left.translation,
     )

@@ -9,9 +9,10 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.tools.lab.planning import CONSTANTS, LampPlan, make_plan, propose_colours, propose_lamps
+from rgbmidic.tools.lab.stereo_planning import stereo_outlooks
 from rgbmidic.tools.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.tools.lab.virtual.rendering import paint, sphere_scene
-from rgbmidic.tools.scene.camera import reference_camera, three_lights
+from rgbmidic.tools.scene.camera import SecondCamera, reference_camera, three_lights
 from rgbmidic.tools.scene.scene import DatasetSettings, Experiment
 from rgbmidic.tools.scene.zones import REFLECTS, predict_zones
 
@@ -156,3 +157,23 @@ def test_a_paint_without_droplets_cannot_be_planned():
     scene = coarse(replace(sphere_scene(), surface=replace(paint(), coverage=0.0)))
     with pytest.raises(InputError, match="no texture"):
         plan(scene)
+
+
+def test_two_cameras_see_depth_as_their_angle_has_it():
+    """On a flat plate far away, w is as uncertain as the geometry of two rays has it, and v as a mean of both."""
+    plate = Scene(body=Plate(), lights=three_lights(), camera=reference_camera((160, 160), focal_px=600 / 0.22))
+    made = plan(coarse(plate), turned(0.5))
+    outlooks = stereo_outlooks(made, SecondCamera(angle_deg=20.0), (40.0,))
+    assert [outlook.angle_deg for outlook in outlooks] == [20.0, 40.0]
+    one = made.std * made.scene.pixel
+    for outlook in outlooks:
+        u, v, w = outlook.std[0]
+        assert v == pytest.approx(one / np.sqrt(2), rel=0.15)
+        sine = np.sin(np.radians(outlook.angle_deg))
+        # w = (x_right - cos x_left) / sin of equal errors
+        assert w == pytest.approx(one * np.sqrt(2 - sine**2) / sine, rel=0.15)
+        assert u == pytest.approx(one, rel=0.2)
+        assert (outlook.seen == 1).all()
+    assert outlooks[1].shape_std[2] < 0.6 * outlooks[0].shape_std[2]
+    below = stereo_outlooks(made, SecondCamera(angle_deg=20.0, azimuth_deg=90.0), ())[0].std[0]
+    assert below[[1, 0, 2]] == pytest.approx(outlooks[0].std[0], rel=0.15)

@@ -1,5 +1,6 @@
 """SCENE.toml to a folder that readers and settings accept; bad files are named errors."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import read_test
 from rgbmidic.tools.lab.virtual import AffineField, MeshField, Polarisers, Sphere, record, render, truth
 from rgbmidic.tools.lab.virtual.dataset import write_dataset, write_stereo_dataset
+from rgbmidic.tools.lab.virtual.view_point import ViewPoint
 from rgbmidic.tools.scene.scene import read_scene
+from rgbmidic.tools.scene.zones import material_points, points_and_normals
 from rgbmidic.tools.stereo import CameraPair
 
 EXAMPLES = Path(__file__).parents[5] / "examples" / "scenes"
@@ -171,16 +174,28 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_two_cameras_see_one_test(tmp_path):
     """The true points project onto the left pixels, and the true motion onto the motion that either camera sees."""
-    text = SMALL.format(camera="", output="").replace("samples = 3", "samples = 1")
+    second = "\n[camera.second]\nangle_deg = 30\nazimuth_deg = 70\nroll_deg = 9\nshape = [50, 70]\nfocal_px = 8000"
+    text = SMALL.format(camera="", output="").replace("samples = 3", f"samples = 1{second}")
     path = scene_file(tmp_path, text.replace("calibration_frames = 2", "calibration_frames = 1"))
     left, right = write_stereo_dataset(path, tmp_path / "out", 20.0)
-    assert read_test(right).region.rectangle == (0, 0, 63, 59)
+    assert read_test(right).region.rectangle == (0, 0, 69, 49)
     pair = CameraPair.read(tmp_path / "out/stereo.json")
     assert pair.angle_deg == pytest.approx(20)
+    assert (pair.right.shape, pair.right.lens[0]) == ((50, 70), 8000)
     with np.load(tmp_path / "out/truth.npz") as file, np.load(left.parent / "truth.npz") as of_left:
         points, moved, seen = file["points"], file["displacement"][1], of_left["displacement"][1]
-    rest, deformed = (pair.project(array.reshape(3, -1).T.astype(float))[0] for array in (points, points + moved))
-    assert rest == pytest.approx(np.indices((60, 64))[::-1].reshape(2, -1).T, abs=1e-2)
-    assert deformed - rest == pytest.approx(seen.reshape(2, -1).T, abs=2e-2)
+    rest, deformed = (pair.project(array.reshape(3, -1).T.astype(float)) for array in (points, points + moved))
+    assert rest[0] == pytest.approx(np.indices((60, 64))[::-1].reshape(2, -1).T, abs=1e-2)
+    assert deformed[0] - rest[0] == pytest.approx(seen.reshape(2, -1).T, abs=2e-2)
+    experiment = read_scene(path)
+    view = ViewPoint.both(experiment.scene, replace(experiment.second, angle_deg=20.0))[1]
+    of_right, body = view.scene(experiment.scene), experiment.scene.body
+    material = material_points(of_right, view.state(body), tuple(rest[1].T))
+    before, after = (
+        points_and_normals(of_right, material, view.state(body, s))[0].T for s in (None, experiment.states[0])
+    )
+    turn, shift = pair.poses[1]
+    assert before == pytest.approx(points.reshape(3, -1).T @ turn.T + shift, abs=1e-3)
+    assert after - before == pytest.approx(moved.reshape(3, -1).T @ turn.T, abs=1e-3)
     with pytest.raises(InputError, match="not 0"):
         write_stereo_dataset(path, tmp_path / "none", 0.0)
