@@ -8,9 +8,10 @@ from rgbmidic.tools.stereo.axes import Axes
 from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh, carry_mesh
-from rgbmidic.tools.stereo.result import QUANTITIES, StereoResult
+from rgbmidic.tools.stereo.result import StereoResult
 from rgbmidic.tools.stereo.run import StereoSettings, measure_stereo
 from rgbmidic.tools.stereo.shape import Shape
+from rgbmidic.tools.stereo.stereo_file import QUANTITIES
 from rgbmidic.tools.stereo.surface import SurfaceGauges
 from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
 

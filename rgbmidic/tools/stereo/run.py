@@ -25,15 +25,17 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.pipeline.source import Series, open_frames
-from rgbmidic.results import Result, frame_times
+from rgbmidic.results import Result, common_variance_fraction, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result
+from rgbmidic.results.result_in_units import reference_frames
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import carry_mesh
-from rgbmidic.tools.stereo.result import STEREO_FILE, StereoResult, write_stereo
+from rgbmidic.tools.stereo.result import StereoResult
 from rgbmidic.tools.stereo.shape import Shape, nodal_values
+from rgbmidic.tools.stereo.stereo_file import STEREO_FILE, write_stereo
 from rgbmidic.typing import AnyArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
@@ -208,18 +210,26 @@ def measure_stereo(
         "gauge_px": shape.gauges.gauges.length,
         "measure": settings.measure,
         "relative_length_std": shape.calibration.length_std,
-        "left": str(first.path.resolve()),
-        "right": str(second.path.resolve()),
+        "calibration_gain": shape.calibration.gain,
+        "common_variance_fraction": common_variance_fraction(first),
+        "left": _path_from(out, first.path),
+        "right": _path_from(out, second.path),
         "calibration": json.dumps({"name": pair.name, "parameters": pair.parameters.tolist()}),
     }
 
     def frames() -> Iterator[dict[str, AnyArray]]:
         for index in range(len(first)):
-            yield shape.frame(nodal_values(first, index, mesh_pair.nodes), nodal_values(second, index))
+            sides = nodal_values(first, index, mesh_pair.nodes), nodal_values(second, index)
+            yield {
+                "number": sides[0]["number"],
+                "status": np.maximum(sides[0]["status"], sides[1]["status"]),
+                "reference": is_reference[index],
+                **shape.frame(*sides),
+            }
 
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    doubts = list[str]()
+    doubts, is_reference = list[str](), reference_frames(first)
     times = frame_times(first)
     write_complete(
         file,
@@ -231,6 +241,12 @@ def measure_stereo(
         if text not in mesh_pair.warnings:  # reported when it was found
             logger.warning("%s", text)
     return StereoResult.open(file)
+
+
+def _path_from(out: Path, path: Path) -> str:
+    """Return the path of a result as seen from the stereo result, where it lies in it: both may be moved together."""
+    path, out = path.resolve(), out.resolve()
+    return path.relative_to(out).as_posix() if path.is_relative_to(out) else str(path)
 
 
 def _resumable(out: Path, run: RunOptions) -> RunOptions:

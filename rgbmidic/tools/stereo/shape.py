@@ -45,6 +45,8 @@ class StereoLimits:
 
 
 LIMITS = StereoLimits()
+MATCHED = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std", "node_status")
+"""Quantities of a camera's result that are triangulated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,16 +136,16 @@ class Shape:
         Parameters
         ----------
         left, right
-            ``u``, ``v``, ``u_std``, ``v_std`` and ``node_status`` of the N nodes of the carried mesh in either test.
+            `MATCHED` quantities of the N nodes of the carried mesh in either test.
 
         Returns
         -------
         dict
             Quantities of `rgbmidic.tools.stereo.result.QUANTITIES` that a frame has, by name.
         """
-        displacements, stds = (
+        displacements, stds, biases = (
             [np.stack([side[f"u{end}"], side[f"v{end}"]], axis=1, dtype=np.float64) for side in (left, right)]
-            for end in ("", "_std")
+            for end in ("", "_std", "_bias_std")
         )
         spread = _diagonal(*stds)
         floored = np.where(np.isfinite(spread), spread, 1.0) + _EXACT**2 * np.eye(4)
@@ -154,6 +156,8 @@ class Shape:
         reference = triangulate(self.pair, *nodes, spread, weights)
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
         covariance = self.axes.covariance(deformed.covariance)
+        gain = self.axes.rotation @ deformed.gain
+        bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
         strain, normal = self.gauges.strain(displacement, covariance)
         covariance = covariance + self.calibration.displacement_covariance(displacement)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -167,6 +171,7 @@ class Shape:
             "left_status": np.asarray(left["node_status"]),
             "right_status": np.asarray(right["node_status"]),
         }
+        values |= dict(zip(("u_bias_std", "v_bias_std", "w_bias_std"), bias.T, strict=True))
         for names, array, error in (
             ("uvw", displacement, std),
             (("exx", "eyy", "exy"), strain.components, strain.components_std),
@@ -216,8 +221,8 @@ class Shape:
 
 def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:
     """Read what `Shape.frame` needs of some nodes of a frame."""
-    values = result.frame(frame).values
-    return {name: np.asarray(values[name])[nodes] for name in ("u", "v", "u_std", "v_std", "node_status")}
+    values = next(result.table.iterate([*MATCHED, "number", "status"], [frame]))
+    return {name: values[name][nodes] if name in MATCHED else values[name] for name in values}
 
 
 def _diagonal(left: FloatArray, right: FloatArray) -> FloatArray:
