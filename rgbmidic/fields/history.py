@@ -24,7 +24,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.fields.units import column
+from rgbmidic.field import column
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 SIGMA = 40.0

@@ -128,23 +128,3 @@ class Units:
         if self.mm_per_pixel is None:
             return values, std
         return self.mm_per_pixel * values, np.hypot(self.mm_per_pixel * std, self.mm_per_pixel_std * values)
-
-
-def column(name: str, unit: str) -> str:
-    """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``.
-
-    Parameters
-    ----------
-    name
-        Of the quantity.
-    unit
-        Its unit; empty for none.
-
-    Returns
-    -------
-    str
-    """
-    plain = unit.replace("²", "2").replace(" √", "_sqrt_")
-    over, _, below = plain.partition("/")
-    words = [word for word in ("" if over == "1" else over, f"per_{below}" if below else "") if word]
-    return "_".join([name, *words])

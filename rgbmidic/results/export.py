@@ -21,7 +21,7 @@ import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.fields.units import column
+from rgbmidic.field import column
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.quantity import ResultQuantity

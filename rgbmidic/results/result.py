@@ -36,6 +36,7 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     import xarray as xr
 
+    from rgbmidic.results.result_in_units import ResultInUnits
     from rgbmidic.settings import ScaleSettings
 
 S = TypeVar("S")
@@ -327,6 +328,22 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
             if np.size(value) or not entry.is_estimated:
                 stacked[index] = value
         return stacked
+
+    def in_units(self, scale: ScaleSettings | None = None) -> ResultInUnits:
+        """Return the result as histories, profiles and maps read it: the units of its ``[scale]``, times and strain.
+
+        Parameters
+        ----------
+        scale
+            It replaces the ``[scale]`` that was kept with the result; None: that one.
+
+        Returns
+        -------
+        ResultInUnits
+        """
+        from rgbmidic.results.result_in_units import ResultInUnits
+
+        return ResultInUnits.without_times(self, scale)
 
     def to_xarray(self, scale: ScaleSettings | None = None) -> xr.Dataset:
         """Return the result with named dimensions, coordinates and units; values are read frame by frame when used.

@@ -11,12 +11,14 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, Self
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.extensions import MESH_SOURCES, load_extension
+from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
@@ -26,7 +28,7 @@ from rgbmidic.results.quantities import ELEMENT_STRAIN, MESH_DOCUMENT, QUANTITIE
 from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -231,6 +233,48 @@ class ResultInUnits(Portable):
         rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
 
+    components: ClassVar[tuple[str, ...]] = ("u", "v")
+
+    @property
+    def path(self) -> Path:
+        """Folder of the result."""
+        return self.result.path
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each frame, length T."""
+        return self.result.names
+
+    @property
+    def number(self) -> IntArray:
+        """Number of each frame, with gaps where frames are lost, shape (T,)."""
+        return np.asarray(self.result.number)
+
+    @property
+    def status(self) -> IntArray:
+        """Status of each frame, shape (T,)."""
+        return np.asarray(self.result.status)
+
+    @property
+    def finished(self) -> BoolArray:
+        """Mask of the frames that are measured, shape (T,)."""
+        return self.result.finished
+
+    @property
+    def references(self) -> BoolArray:
+        """Mask of the frames that belong to the reference, shape (T,)."""
+        return reference_frames(self.result)
+
+    @cached_property
+    def seconds(self) -> FloatArray | None:
+        """Time of each frame in s, shape (T,); None where no time is known."""
+        return frame_times(self.result, self.scale)
+
+    @property
+    def points(self) -> FloatArray:
+        """Places of the nodes on the reference in rectified px, shape (N, 2)."""
+        return self.mesh.nodes
+
     @property
     def mesh(self) -> Tri3Mesh:
         """The mesh in rectified px; in px where no camera is stated."""
@@ -321,6 +365,23 @@ class ResultInUnits(Portable):
     def length(self) -> float:
         """Factor from px to the unit of lengths."""
         return self.units.mm_per_pixel or 1.0
+
+    def displacement(self, frame: int) -> Displacement:
+        """Read the displacement of all nodes in a frame, in rectified px."""
+        u, v, u_std, v_std, u_bias, v_bias = next(displacements(self.result, self.rectified, [frame]))
+        return Displacement(
+            dims=("component", "node"),
+            values=np.stack([u, v]),
+            std=np.stack([u_std, v_std]),
+            bias=np.stack([u_bias, v_bias]),
+        )
+
+    def field(self, name: str, frame: int) -> Field:
+        """Read one of the `quantities` with its standard uncertainty in a frame."""
+        values = self.frame(frame)
+        std, bias = (values.get(f"{name}{suffix}") for suffix in ("_std", "_bias_std"))
+        unit = self.quantities[name].unit
+        return Field(name=name, unit=unit, dims=("node",), values=values[name], std=std, bias=bias)
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""

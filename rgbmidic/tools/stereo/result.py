@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from rgbmidic.errors import InputError, ResultError, import_optional
-from rgbmidic.fields.units import column
+from rgbmidic.field import column
 from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES, SCHEMA, SHARED, STEREO_FILE, VERSION, dimensions
 from rgbmidic.typing import AnyArray, FloatArray

@@ -15,7 +15,7 @@ from textures import rigid_pair
 import rgbmidic
 import rgbmidic_calibration
 from rgbmidic import correlate
-from rgbmidic.fields.units import column
+from rgbmidic.field import column
 from rgbmidic.results import (
     FrameRecord,
     Maps,
