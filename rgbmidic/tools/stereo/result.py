@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Self
 
 import numpy as np
 
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.field import column
-from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
+from rgbmidic.results import Result, ResultQuantity
+from rgbmidic.results.files import write_table
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES, SCHEMA, SHARED, STEREO_FILE, VERSION, dimensions
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +37,9 @@ class StereoResult:
     elements : ndarray, shape (E, 3)
         Nodes of the triangles.
     time : ndarray, shape (T,)
-        s, or the number of the frame where times are not known.
+        s, or the index of the frame where times are not known.
+    has_times
+        Whether they are.
     """
 
     path: Path
@@ -44,6 +47,7 @@ class StereoResult:
     names: tuple[str, ...]
     elements: AnyArray
     time: FloatArray
+    has_times: bool
 
     @classmethod
     def open(cls, path: Path | str) -> Self:
@@ -81,6 +85,7 @@ class StereoResult:
                     names=names,
                     elements=content["elements"][...],
                     time=content["time"][...],
+                    has_times=content["time"].attrs["units"] == "s",
                 )
         except (OSError, KeyError, ValueError, TypeError) as error:
             if isinstance(error, ResultError):
@@ -108,6 +113,52 @@ class StereoResult:
         except (OSError, KeyError) as error:
             raise ResultError(f"{self.path} is damaged: {error}") from None
 
+    def frame(self, names: Iterable[str], index: int) -> dict[str, AnyArray]:
+        """Read quantities of one frame.
+
+        Parameters
+        ----------
+        names
+            Their names, those of `QUANTITIES` that frames have.
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        dict of str to ndarray
+        """
+        import h5py
+
+        if not 0 <= index < len(self):
+            raise InputError(f"there is no frame {index} in a result of {len(self)} frames (0 to {len(self) - 1})")
+        try:
+            with h5py.File(self.path, "r") as content:
+                return {name: np.asarray(content[name][index]) for name in names}
+        except (OSError, KeyError) as error:
+            raise ResultError(f"{self.path} is damaged: {error}") from None
+
+    def camera(self, side: Literal["left", "right"]) -> Result:
+        """Open the ordinary result of a camera.
+
+        Parameters
+        ----------
+        side
+            Which.
+
+        Returns
+        -------
+        Result
+
+        Raises
+        ------
+        ResultError
+            It is not where it was, or is damaged.
+        """
+        folder = self.path.parent / str(self.attributes[side])
+        if not folder.is_dir():
+            raise ResultError(f"the result of the {side} camera, {folder}, is not there any more; {self.path} needs it")
+        return Result.open(folder)
+
     def to_xarray(self) -> xr.Dataset:
         """Return all quantities with named dimensions, coordinates and units.
 
@@ -129,72 +180,35 @@ class StereoResult:
         dataset: xr.Dataset = xarray.Dataset(variables, coordinates, dict(self.attributes))
         return dataset.set_coords(["x", "y", "z"])
 
-    def write_csv(self, folder: Path | str, *, overwrite: bool = False) -> None:
-        """Write a CSV file for each frame: a row per node, names of the columns with their units.
+    def export(self, to: str, file: BinaryIO) -> None:
+        """Write all frames for another program.
 
         Parameters
         ----------
-        folder
-            Folder of the files ``000000.csv`` and so on; it is made.
-        overwrite
-            Whether existing files may be replaced.
-
-        Raises
-        ------
-        ResultError
-            A file exists or cannot be written.
+        to
+            ``"hdf5"``: the file as it is, for ParaView, MATLAB and xarray. ``"csv"``: a row per frame and node, with
+            the quantities that are one number per node, their units in the names of the columns. ``"npz"``: every
+            quantity of `QUANTITIES`, ``elements``, ``names`` and ``time``, frames first.
+        file
+            Open file.
         """
-        folder = Path(folder)
-        entries = [entry for entry in QUANTITIES.values() if entry.axes == ("node",)]
-        with write_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        head = ["node", *(column(entry.name, entry.unit) for entry in entries)]
-        arrays = {entry.name: self[entry.name] for entry in entries}
-        for frame in range(len(self)):
-            columns = [arrays[entry.name] if entry in SHARED else arrays[entry.name][frame] for entry in entries]
-            rows = ([node, *values] for node, values in enumerate(zip(*(c.tolist() for c in columns), strict=True)))
-            file = folder / f"{frame:06d}.csv"
-            check_file(file, overwrite=overwrite)
-            write_complete(file, lambda stream, rows=rows: write_table(stream, head, rows))  # type: ignore[misc]
+        if to == "hdf5":
+            with self.path.open("rb") as source:
+                shutil.copyfileobj(source, file)
+        elif to == "npz":
+            arrays = {"elements": self.elements, "names": np.array(self.names), "time": self.time}
+            np.savez(file, **arrays, **{name: self[name] for name in QUANTITIES})
+        else:
+            entries = [entry for entry in QUANTITIES.values() if entry.axes == ("node",)]
+            time = ["time_s"] if self.has_times else []
+            head = ["frame", "number", "name", *time, "status", "node"]
+            write_table(file, [*head, *(column(entry.name, entry.unit) for entry in entries)], self._rows(entries))
 
-    def figure(self, name: str, frame: int = -1) -> Figure:
-        """Draw a quantity over the left reference.
-
-        Parameters
-        ----------
-        name
-            Quantity with one number a node.
-        frame
-            Index of the frame; from the end where negative.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        InputError
-            There is no such quantity with one number a node, or no such frame.
-        """
-        from matplotlib.figure import Figure
-        from matplotlib.tri import Triangulation
-
-        if name not in QUANTITIES or QUANTITIES[name].axes != ("node",):
-            allowed = [entry.name for entry in QUANTITIES.values() if entry.axes == ("node",)]
-            raise InputError(f"no map of {name!r}; there are {', '.join(allowed)}")
-        if not -len(self) <= frame < len(self):
-            raise InputError(f"there is no frame {frame} in a result of {len(self)} frames")
-        entry = QUANTITIES[name]
-        values = np.asarray(self[name] if entry in SHARED else self[name][frame], dtype=np.float64)
-        figure = Figure(layout="constrained")
-        axes = figure.subplots()
-        x, y, triangles = self["x_left"], self["y_left"], self.elements
-        is_shown = np.isfinite(values)[triangles].all(axis=1)
-        if is_shown.any():
-            grid = Triangulation(x, y, triangles[is_shown])
-            picture = axes.tripcolor(grid, np.nan_to_num(values), shading="gouraud")
-            figure.colorbar(picture, label=entry.label)
-        axes.set(aspect="equal", xlabel="x, left reference (px)", ylabel="y, left reference (px)")
-        axes.set_title(entry.description if entry in SHARED else f"{entry.description}: {self.names[frame]}")
-        axes.invert_yaxis()
-        return figure
+    def _rows(self, entries: Sequence[ResultQuantity]) -> Iterator[list[object]]:
+        names, shared = [entry.name for entry in entries], {entry.name for entry in SHARED}
+        same = {name: self[name] for name in names if name in shared}
+        for frame, (name, seconds) in enumerate(zip(self.names, self.time.tolist(), strict=True)):
+            values = self.frame(["number", "status", *(one for one in names if one not in shared)], frame) | same
+            cells = [frame, int(values["number"]), name, *([f"{seconds:.12g}"] if self.has_times else [])]
+            columns = zip(*(values[one].tolist() for one in names), strict=True)
+            yield from ([*cells, int(values["status"]), node, *numbers] for node, numbers in enumerate(columns))

@@ -158,14 +158,17 @@ class Shape:
         covariance = self.axes.covariance(deformed.covariance)
         gain = self.axes.rotation @ deformed.gain
         bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
-        strain, normal = self.gauges.strain(displacement, covariance)
+        surface = self.gauges.strain(displacement, covariance)
+        strain = surface.strain
         covariance = covariance + self.calibration.displacement_covariance(displacement)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
             "epipolar_change": deformed.residual - reference.residual,
             "epipolar_change_std": deformed.residual_std,
-            "normal": normal,
+            "normal": surface.normal,
+            "tilt": surface.tilt,
+            "tilt_std": surface.tilt_std,
             "direction": strain.direction_deg,
             "direction_std": strain.direction_std_deg,
             "left_status": np.asarray(left["node_status"]),

@@ -60,6 +60,7 @@ _OF_FRAMES = [
     *_with_std(["e1", "e2"], "", "principal surface strain {}"),
     *_with_std(["direction"], "degree", "direction of e1 in the tangent plane, from x towards y"),
     ResultQuantity("normal", ("node", 3), "", "", "unit normal of the deformed surface"),
+    *_with_std(["tilt"], "degree", "angle between the normals of the undeformed and of the deformed surface"),
     *_with_std(["epipolar_change"], "px", "epipolar residual less that of the reference states"),
     ResultQuantity("left_status", _NODE, "", "", "node in the left test", dtype=np.uint8, blank=1, codes=_STATUS),
     ResultQuantity("right_status", _NODE, "", "", "node in the right test", dtype=np.uint8, blank=1, codes=_STATUS),

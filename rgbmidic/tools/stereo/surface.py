@@ -15,8 +15,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.fields import NodalCovariance, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.strain import length_of
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceStrain:
+    """Strain and attitude of a surface at G gauges; NaN where not measured.
+
+    Attributes
+    ----------
+    strain
+        In the tangent plane of the undeformed surface: its first axis is the projection of x, the second one that of y
+        made normal to it.
+    normal : ndarray, shape (G, 3)
+        Unit normal of the deformed surface, with a positive component along z.
+    tilt, tilt_std : ndarray, shape (G,)
+        Angle between the normals of the undeformed and of the deformed surface, and its standard uncertainty, degrees.
+    """
+
+    strain: Strain
+    normal: FloatArray
+    tilt: FloatArray
+    tilt_std: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,8 +83,8 @@ class SurfaceGauges:
         gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh), length)
         return cls(gauges=gauges, points=points, measure=measure)
 
-    def strain(self, displacement: FloatArray, covariance: FloatArray) -> tuple[Strain, FloatArray]:
-        """Compute strain of the surface and the normal of the deformed one.
+    def strain(self, displacement: FloatArray, covariance: FloatArray) -> SurfaceStrain:
+        """Compute strain and attitude of the deformed surface.
 
         Parameters
         ----------
@@ -74,11 +96,7 @@ class SurfaceGauges:
 
         Returns
         -------
-        strain : Strain
-            In the tangent plane of the undeformed surface: its first axis is the projection of x, the second one that
-            of y made normal to it.
-        normal : ndarray, shape (N, 3)
-            Unit normal of the deformed surface, with a positive component along z.
+        SurfaceStrain
         """
         gauges = self.gauges
         measured = np.asarray(np.isfinite(displacement).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
@@ -98,24 +116,51 @@ class SurfaceGauges:
         # (G, 2, 2, 3, 3) -> of slopes row by row: (G, 3, 2, 3, 2)
         of_slopes = sums.reshape(-1, 2, 2, 3, 3).transpose(0, 3, 1, 4, 2)
 
-        valid = np.asarray(np.isfinite(slopes + tangents).all(axis=(1, 2)))
-        flat = np.eye(3)[:, :2]
-        tangents, slopes = (np.where(valid[:, None, None], array, flat) for array in (tangents, slopes))
-        deformed = tangents + slopes
-        to_axes = np.linalg.inv(_tangent_axes(tangents).transpose(0, 2, 1) @ tangents)
-        gradient = deformed @ to_axes
-        left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
-        turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
-        spread_in_plane = np.einsum(
-            "gai,gdb,gidje,gcj,gef->gabcf", turn, to_axes, of_slopes, turn, to_axes, optimize=True
-        )
-        in_plane = turn @ gradient - np.eye(2)
-        in_plane[~valid] = np.nan
-        spread_in_plane[~valid] = np.nan
-        normal = np.cross(deformed[:, :, 0], deformed[:, :, 1])
-        normal *= (np.where(normal[:, 2] < 0, -1, 1) / np.linalg.norm(normal, axis=1))[:, None]
-        normal[~valid] = np.nan
-        return strain_of_gradient(in_plane, spread_in_plane.reshape(-1, 4, 4), self.measure), normal
+        return surface_strain(tangents, slopes, of_slopes, self.measure)
+
+
+def surface_strain(tangents: FloatArray, slopes: FloatArray, covariance: FloatArray, measure: str) -> SurfaceStrain:
+    """Compute the strain of surfaces with these tangents.
+
+    Parameters
+    ----------
+    tangents, slopes : ndarray, shape (G, 3, 2)
+        Derivatives of the undeformed surface and of the displacement along two directions of the left frame.
+    covariance : ndarray, shape (G, 3, 2, 3, 2)
+        Of the slopes.
+    measure
+        Strain measure.
+
+    Returns
+    -------
+    SurfaceStrain
+    """
+    valid = np.asarray(np.isfinite(slopes + tangents).all(axis=(1, 2)))
+    flat = np.eye(3)[:, :2]
+    tangents, slopes = (np.where(valid[:, None, None], array, flat) for array in (tangents, slopes))
+    deformed = tangents + slopes
+    axes = _tangent_axes(tangents)
+    to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
+    gradient = deformed @ to_axes
+    left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
+    turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
+    spread = np.einsum("gdb,gidje,gef->gibjf", to_axes, covariance, to_axes, optimize=True)
+    spread_in_plane = np.einsum("gai,gibjf,gcj->gabcf", turn, spread, turn, optimize=True)
+    in_plane = turn @ gradient - np.eye(2)
+    normal = np.cross(deformed[:, :, 0], deformed[:, :, 1])
+    normal *= (np.where(normal[:, 2] < 0, -1, 1) / np.linalg.norm(normal, axis=1))[:, None]
+    # to first order the normal turns by the slopes along it
+    of_tilt = np.einsum("gi,gibjf,gj->gbf", normal, spread, normal)
+    sine, sine_std = length_of(np.einsum("gi,gia->ga", normal, axes), of_tilt)
+    tilt = np.arcsin(np.minimum(sine, 1))
+    for array in (in_plane, spread_in_plane, normal, tilt):
+        array[~valid] = np.nan
+    return SurfaceStrain(
+        strain=strain_of_gradient(in_plane, spread_in_plane.reshape(-1, 4, 4), measure),
+        normal=normal,
+        tilt=np.degrees(tilt),
+        tilt_std=np.degrees(np.where(valid, sine_std, np.nan)),
+    )
 
 
 def _tangent_axes(tangents: FloatArray) -> FloatArray:
