@@ -15,12 +15,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from rgbmidic import Result, TestSettings, measure
-from rgbmidic.fields import Nodal, make_probe, rates, reference_fraction
+from rgbmidic.fields import Displacement, Field, make_probe, rates, reference_fraction
 from rgbmidic.frames import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.results.result_in_units import ResultInUnits, displacements
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.tools.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -141,10 +141,9 @@ def places(points: FloatArray, glare_reach: float, is_glaring: bool) -> dict[str
 def rate(values: FloatArray, std: FloatArray, truth: FloatArray) -> FloatArray:
     """Error over stated uncertainty (T, P) of the rate of values; `truth` (2, T, P) is just before and after each."""
     times = np.arange(float(FRAMES))
-    found = rates(
-        times, values, std, window=WINDOW - 1.0, common_fraction=reference_fraction(REST), references=times < REST
-    )
-    return np.asarray((found.velocity - (truth[1] - truth[0]) / (2 * STEP)) / found.velocity_std)
+    options = {"window": WINDOW - 1.0, "common_fraction": reference_fraction(REST), "references": times < REST}
+    velocity = rates(times, Field(name="u", values=values, std=std), **options)["velocity"]
+    return np.asarray((velocity.values - (truth[1] - truth[0]) / (2 * STEP)) / velocity.uncertainty)
 
 
 def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
@@ -170,9 +169,9 @@ def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray,
     grid = np.stack(np.meshgrid(np.arange(50.0, 360, 30), [65.0, 100.0, 135.0]), axis=-1).reshape(-1, 2)
     grid = grid[np.hypot(*(grid - HOLE).T) > RADIUS + length / 2 + 4]
     gauges = [make_probe(physical.covariance, "strain_gauge", 1, (x, y, length)) for x, y in grid]
-    fields = np.stack(list(displacements(result, physical.rectified, list(range(FRAMES)))), axis=1)
-    exact = [np.concatenate([np.moveaxis(part, -1, 0), np.full((2, *part.shape[:2]), STEP)]) for part in truth]
-    series = [[gauge.histories(Nodal.of(part[..., gauge.nodes]))[0] for gauge in gauges] for part in (fields, *exact)]
+    fields = Displacement.stack([physical.displacement(frame) for frame in range(FRAMES)])
+    exact = [Displacement.in_plane(*np.moveaxis(part, -1, 0), *np.full((2, *part.shape[:2]), STEP)) for part in truth]
+    series = [[gauge.histories(part.isel(node=gauge.nodes))[0] for gauge in gauges] for part in (fields, *exact)]
     found, *true = (np.stack([one.values for one in row], axis=1) for row in series)
     std = np.stack([one.std for one in series[0]], axis=1)
     strain_rate = rate(found, std, np.stack(true[::2]))

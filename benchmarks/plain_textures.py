@@ -13,13 +13,11 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Reference
-from rgbmidic.fields import Nodal, NodalCovariance, difference_std, make_probe, reference_fraction
+from rgbmidic.fields import Displacement, NodalCovariance, difference_std, make_probe, reference_fraction
 from rgbmidic.typing import FloatArray
 
 from .tables import Row, table
 from .uncertainty import covered, rms
-
-NODAL = ("u", "v", "u_std", "v_std")
 
 
 @table("elements", page="explanation/uncertainty", cost=40, keys=3)
@@ -78,7 +76,7 @@ def probes(quick: bool) -> Iterator[Row]:
     fields = np.stack(draws)
     for number, (title, (kind, place)) in enumerate(PLACES.items()):
         probe = make_probe(covariance, kind, number, place)
-        read = [probe.histories(Nodal(**dict(zip(NODAL, draw[..., probe.nodes], strict=True)))) for draw in fields]
+        read = [probe.histories(Displacement.in_plane(*draw[..., probe.nodes])) for draw in fields]
         for histories in zip(*read, strict=True):
             name = histories[0].name.removeprefix(f"{kind}_{number}_")
             # directions and invariants mean nothing without strain, a gauge's strain is its extension over its length

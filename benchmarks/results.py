@@ -63,8 +63,8 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
                         ]
                     )
                     jump = crack_jump(mesh.nodes, mesh.elements, found, (10, PATH[0][1]), PATH[1])
-                    error = jump.opening - opening_at(jump.points[:, 0], opening)
-                    ratio = np.stack([error / jump.opening_std, jump.sliding / jump.sliding_std])[..., :-1]
+                    error = jump.opening.values - opening_at(jump.points[:, 0], opening)
+                    ratio = np.stack([error / jump.opening.std, jump.sliding.values / jump.sliding.std])[..., :-1]
                     known.append(np.isfinite(ratio).mean())
                     ratios.append(ratio.reshape(2, -1))
         opened, slid = np.sqrt(np.nanmean(np.concatenate(ratios, axis=1) ** 2, axis=1))

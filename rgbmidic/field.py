@@ -6,17 +6,18 @@ Histories, profiles, maps, figures, movies, exports and reports pass each other 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from rgbmidic.fields import NodalCovariance, Units
+    from rgbmidic.fields import NodalCovariance, Rectification, Units
     from rgbmidic.mesh import Tri3Mesh
     from rgbmidic.results import ResultQuantity
 
@@ -124,6 +125,30 @@ class Field:
         stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
         return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
 
+    @classmethod
+    def join(cls, parts: Sequence[Self], dim: str) -> Self:
+        """Join fields along an axis that they have.
+
+        Parameters
+        ----------
+        parts
+            Fields of the same axes.
+        dim
+            Name of the axis.
+
+        Returns
+        -------
+        Field
+        """
+        first, *others = parts
+        axis = first.dims.index(dim) - len(first.dims)
+        return first.with_arrays(lambda *arrays: np.concatenate(arrays, axis=axis), *others)
+
+    @property
+    def is_doubtful(self) -> BoolArray:
+        """Mask of the values that lie within two standard uncertainties of 0."""
+        return np.asarray(np.abs(self.values) < 2 * self.uncertainty)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Displacement(Field):
@@ -138,7 +163,8 @@ class Displacement(Field):
 
     Examples
     --------
-    >>> still = Displacement(values=np.zeros((2, 1, 3)), std=np.full((2, 1, 3), 0.01))  # u, v of 3 nodes in a frame
+    >>> zero = np.zeros((1, 3))
+    >>> still = Displacement.in_plane(zero, zero, zero + 0.01, zero + 0.01)  # of 3 nodes in a frame
     >>> [(component.name, component.dims, component.unit) for component in still.components]
     [('u', ('frame', 'node'), 'px'), ('v', ('frame', 'node'), 'px')]
     """
@@ -147,6 +173,26 @@ class Displacement(Field):
     unit: str = "px"
     dims: tuple[str, ...] = ("component", "frame", "node")
     covariance: FloatArray | None = None
+
+    @classmethod
+    def in_plane(cls, u: npt.ArrayLike, v: npt.ArrayLike, *std: npt.ArrayLike) -> Self:
+        """Take u and v, their standard uncertainties, and what the bias of the lights leaves of these.
+
+        Parameters
+        ----------
+        u, v : array_like, shape (N,) or (T, N)
+            Displacement in px; NaN where a node has no data.
+        *std : array_like of the same shape
+            u_std and v_std, u_bias and v_bias; those that are not given are not known, or 0.
+
+        Returns
+        -------
+        Displacement
+        """
+        pairs = [np.stack(np.broadcast_arrays(*pair)).astype(np.float64) for pair in ((u, v), std[:2], std[2:]) if pair]
+        values, total, bias = [*pairs, None, None][:3]
+        assert values is not None
+        return cls(dims=("component", *("frame", "node")[3 - values.ndim :]), values=values, std=total, bias=bias)
 
     @property
     def components(self) -> tuple[Field, ...]:
@@ -163,6 +209,52 @@ class Displacement(Field):
             )
             for row, (name, values, std) in enumerate(arrays)
         )
+
+    def smaller(self, other: Self) -> Self:
+        """Return the displacement with the smaller one of the uncertainties of two, at each node.
+
+        Parameters
+        ----------
+        other
+            Of the same nodes.
+
+        Returns
+        -------
+        Displacement
+        """
+        flat = replace(self, covariance=None).with_arrays(np.minimum, replace(other, covariance=None))
+        flat = replace(flat, values=self.values)
+        if self.covariance is None or other.covariance is None:
+            return flat
+        traces = (np.einsum("ii...->...", one.covariance) for one in (self, other))
+        return replace(flat, covariance=np.where(np.less(*traces), self.covariance, other.covariance))
+
+    def since(self, base: Self, common_fraction: float) -> Self:
+        """Return the displacement since another frame.
+
+        Parameters
+        ----------
+        base
+            Displacement of the same nodes in that frame.
+        common_fraction
+            Fraction of the smaller variance that both have in common.
+
+        Returns
+        -------
+        Displacement
+        """
+        smaller = self.smaller(base)
+
+        def difference(now: FloatArray, before: FloatArray, shared: FloatArray) -> FloatArray:
+            return np.sqrt(np.maximum(now**2 + before**2 - 2 * common_fraction * shared**2, 0))
+
+        flat, *others = (replace(one, covariance=None) for one in (self, base, smaller))
+        moved = replace(flat.with_arrays(difference, *others), values=self.values - base.values)
+        if self.covariance is None or base.covariance is None or smaller.covariance is None:
+            return moved
+        covariance = self.covariance + base.covariance - 2 * common_fraction * smaller.covariance
+        std = np.sqrt(np.maximum(np.einsum("ii...->i...", covariance), 0))
+        return replace(moved, covariance=covariance, std=std)
 
     @property
     def is_measured(self) -> BoolArray:
@@ -202,6 +294,22 @@ class FieldSource(Protocol):
     @property
     def references(self) -> BoolArray:
         """Mask of the frames that belong to the reference, shape (T,)."""
+
+    @property
+    def common_fraction(self) -> float:
+        """Fraction of a frame's variance that all frames have in common, that of the reference."""
+
+    @property
+    def exposure(self) -> float:
+        """Exposure of a frame in s; 0 where it is not known."""
+
+    @property
+    def remarks(self) -> Iterable[str]:
+        """What a reader should know of lengths, a line each."""
+
+    @property
+    def rectified(self) -> Rectification | None:
+        """Change from px of the image, in which probes are placed, to those of `mesh`; None: they are the same."""
 
     @property
     def seconds(self) -> FloatArray | None:

@@ -6,7 +6,7 @@ import numpy as np
 from textures import Texture
 
 from rgbmidic import correlate
-from rgbmidic.fields import Nodal, Units
+from rgbmidic.fields import Displacement, Units
 from rgbmidic.tools.finite_elements import Williams
 from rgbmidic.tools.finite_elements.crack_tip import williams_series
 
@@ -92,4 +92,4 @@ def cracked(noise, seed, element_size=16):
 
 def as_nodal(solutions):
     u, v, u_std, v_std = np.moveaxis([np.c_[one.displacement, one.displacement_std] for one in solutions], -1, 0)
-    return Nodal(u=u, v=v, u_std=u_std, v_std=v_std)
+    return Displacement.in_plane(u, v, u_std, v_std)

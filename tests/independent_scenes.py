@@ -18,7 +18,7 @@ import real_files
 import scipy.sparse as sp
 
 from rgbmidic import Tri3Mesh, measure
-from rgbmidic.fields import MeshPoints, Nodal, NodalCovariance, at_nodes, at_pixels
+from rgbmidic.fields import Displacement, MeshPoints, NodalCovariance, at_nodes, at_pixels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES
@@ -97,22 +97,24 @@ def figures(scene: str, out: Path) -> Figures:
     )
     result = measure(settings, out / "result", workers=1)
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    nodal = Nodal.of(np.stack([np.asarray(getattr(result, name)) for name in DISPLACEMENT_QUANTITIES]))
+    displacement = Displacement.in_plane(*(getattr(result, name) for name in DISPLACEMENT_QUANTITIES))
     found: Figures = {}
-    for quantity, errors, stds in compared(mesh, nodal, truth):
+    for quantity, errors, stds in compared(mesh, displacement, truth):
         for frame, error, std in list(zip(number, errors, stds, strict=True))[1:]:
             ratio = float(np.sqrt(np.mean((error / std) ** 2)))
             found[scene, frame, quantity] = float(np.sqrt(np.mean(error**2))), ratio
     return found
 
 
-def compared(mesh: Tri3Mesh, nodal: Nodal, truth: FloatArray) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+def compared(
+    mesh: Tri3Mesh, displacement: Displacement, truth: FloatArray
+) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Errors and stated uncertainties, by frame, of each quantity: at pixels (where none is stated), nodes and centres
     of elements, of means over squares and of extensometers.
     """
     low, high = mesh.nodes.min(axis=0) + MARGIN, mesh.nodes.max(axis=0) - MARGIN
     (left, top), (right, bottom) = np.ceil(low).astype(int), high.astype(int) + 1
-    moved = nodal.components[:, 0].swapaxes(0, 1)
+    moved = displacement.values.swapaxes(0, 1)
     field = at_pixels(mesh, moved.reshape(-1, len(mesh.nodes)).T, truth.shape[2:]).reshape(truth.shape)
     yield "pixels", (field - truth)[..., top:bottom, left:right], np.full(len(field), np.nan)
     covariance, has_data = NodalCovariance.from_mesh(mesh), np.ones(len(mesh.nodes), dtype=bool)
@@ -123,9 +125,13 @@ def compared(mesh: Tri3Mesh, nodal: Nodal, truth: FloatArray) -> Iterator[tuple[
         weights = (sp.kron(sp.eye(len(points)), factors, format="csr") @ at).toarray()
         exact = np.stack([at_nodes(frame, points.reshape(-1, 2)) for frame in truth])
         exact = np.einsum("tspc,p->tcs", exact.reshape(len(truth), *points.shape), factors)
+        assert displacement.bias is not None
         variance = [
-            [covariance.variance(weights, *noise) for noise in frames]
-            for frames in nodal.components[:, 1:, :, None].swapaxes(1, 2)
+            [
+                covariance.variance(weights, *noise)
+                for noise in zip(one.uncertainty[:, None], one.bias[:, None], strict=True)
+            ]
+            for one in displacement.components
         ]
         return moved @ weights.T - exact, np.sqrt(variance).swapaxes(0, 1), exact
 

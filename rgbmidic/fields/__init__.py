@@ -1,7 +1,8 @@
 """From a solution to what an engineer reads: the field at pixels and nodes, strain, rates, units, probes."""
 
+from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.cracks import Jump, crack_jump
-from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
+from rgbmidic.fields.history import SIGMA, Probe, high_pass, rates
 from rgbmidic.fields.interpolation import MeshPoints, at_nodes, at_pixels, field_rms
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, difference_std, frame_covariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
@@ -17,15 +18,14 @@ __all__ = [
     "SIGMA",
     "Area",
     "CameraCalibration",
-    "History",
+    "Displacement",
+    "Field",
     "Jump",
     "Mean",
     "MeshPoints",
-    "Nodal",
     "NodalCovariance",
     "Probe",
     "ProfileLine",
-    "Rates",
     "Rectification",
     "RigidMotion",
     "Strain",

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.fields.history import History, Nodal
+from rgbmidic.field import Displacement, Field
+from rgbmidic.fields.history import of_probe
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.outline_mesh import edge_keys
@@ -32,26 +33,23 @@ class Jump:
         Of the pairs along the crack from its first point, px on the reference.
     points : ndarray, shape (P, 2)
         Their places on the reference, px.
-    opening, opening_std : ndarray, shape (T, P)
-        Jump across the deformed crack, positive where it is open, and its standard uncertainty.
-    sliding, sliding_std : ndarray, shape (T, P)
+    opening
+        Jump across the deformed crack, positive where it is open, shape (T, P).
+    sliding
         Jump along it, positive where the left side is ahead.
 
     Examples
     --------
-    >>> zero = np.zeros((1, 3))
-    >>> places = {"distance": zero[0], "points": np.zeros((3, 2))}
-    >>> jump = Jump(**places, opening=zero, opening_std=zero, sliding=zero, sliding_std=zero)
-    >>> jump.opening.shape
+    >>> none = Field(name="opening", unit="px", dims=("frame", "pair"), values=np.zeros((1, 3)), std=np.zeros((1, 3)))
+    >>> jump = Jump(distance=np.zeros(3), points=np.zeros((3, 2)), opening=none, sliding=none)
+    >>> jump.opening.values.shape
     (1, 3)
     """
 
     distance: FloatArray
     points: FloatArray
-    opening: FloatArray
-    opening_std: FloatArray
-    sliding: FloatArray
-    sliding_std: FloatArray
+    opening: Field
+    sliding: Field
 
 
 class JumpAlong:
@@ -105,50 +103,51 @@ class JumpAlong:
         """Places on the crack before and after each pair."""
         return np.maximum(self.pairs - 1, 0), np.minimum(self.pairs + 1, len(self.points) - 1)
 
-    def read(self, nodal: Nodal) -> Jump:
+    def read(self, displacement: Displacement) -> Jump:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
         previous, following = self._beside
         across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
-        u, *stds = nodal.fields[..., self.stencil].reshape(3, 2, len(nodal.u), *self.stencil.shape)
+        at_stencil = displacement.with_arrays(lambda array: array[..., self.stencil])
+        u, std = at_stencil.values, at_stencil.uncertainty
+        bias = np.zeros_like(std) if at_stencil.bias is None else at_stencil.bias
         jump, arm = u @ across, (self.points[following] - self.points[previous]).T[:, None] + u @ along
         length = np.hypot(*arm)
         tangent = arm / length
         normal = np.stack([tangent[1], -tangent[0]])
         opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
 
-        def error(axis: FloatArray, turn: FloatArray) -> FloatArray:
+        def jump_field(name: str, values: FloatArray, axis: FloatArray, turn: FloatArray) -> Field:
             coefficients = axis[..., None] * across + turn[..., None] * along
             pairs = enumerate(self.covariances)
             square = [
-                covariance.variance(coefficients[:, :, p], *(std[:, :, p] for std in stds)).sum(axis=0)
+                covariance.variance(coefficients[:, :, p], std[:, :, p], bias[:, :, p]).sum(axis=0)
                 for p, covariance in pairs
             ]
-            return np.asarray(np.sqrt(np.stack(square, axis=1)))
+            errors = np.sqrt(np.stack(square, axis=1))
+            return Field(name=name, unit="px", dims=("frame", "pair"), values=values, std=errors)
 
         # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
         steps = np.hypot(*np.diff(self.points, axis=0, prepend=self.points[:1]).T)
         return Jump(
             distance=np.cumsum(steps)[self.pairs],
             points=self.points[self.pairs],
-            opening=opening,
-            opening_std=error(normal, -sliding / length * normal),
-            sliding=sliding,
-            sliding_std=error(tangent, opening / length * normal),
+            opening=jump_field("opening", opening, normal, -sliding / length * normal),
+            sliding=jump_field("sliding", sliding, tangent, opening / length * normal),
         )
 
-    def histories(self, nodal: Nodal) -> list[History]:
+    def histories(self, displacement: Displacement) -> list[Field]:
         """Compute opening and sliding of every pair in px."""
-        jump = self.read(nodal)
+        jump = self.read(displacement)
         positions = ", ".join(f"{distance:.4g}" for distance in jump.distance)
         note = (
             f"{self.name}: jump of the left side against the right one, across and along the deformed crack, at its "
             f"pairs of nodes 1 to {len(self.pairs)}, which are {positions} px from its first point"
         )
-        components = {"opening": (jump.opening, jump.opening_std), "sliding": (jump.sliding, jump.sliding_std)}
         return [
-            History(name=f"{self.name}_{pair}_{kind}", unit="px", values=series, std=error, note=note)
-            for kind, (values, std) in components.items()
-            for pair, (series, error) in enumerate(zip(values.T, std.T, strict=True), start=1)
+            history
+            for field in (jump.opening, jump.sliding)
+            for pair in range(len(self.pairs))
+            for history in of_probe(f"{self.name}_{pair + 1}", [field.isel(pair=pair)], note)
         ]
 
 
@@ -186,7 +185,7 @@ def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, 
 def crack_jump(
     nodes: FloatArray,
     elements: npt.NDArray[np.int32],
-    displacement: Nodal,
+    displacement: Displacement,
     start: tuple[float, float],
     end: tuple[float, float],
 ) -> Jump:
@@ -199,7 +198,7 @@ def crack_jump(
     elements : ndarray, shape (E, 3)
         Node indices.
     displacement
-        Of all nodes, each field (T, N), px.
+        Of all nodes, shape (2, T, N), px.
     start, end
         Points (x, y) on the crack, px: left and right are those of who walks from one to the other.
 
@@ -218,15 +217,10 @@ def crack_jump(
     >>> region = Region.from_rectangle((0, 0, 80, 60), shape=(80, 100))
     >>> mesh = Tri3Mesh.from_region(region, element_size=10, cracks=[[(0, 30), (40, 30)]])
     >>> zero = np.zeros((1, len(mesh.nodes)))
-    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
-    >>> crack_jump(mesh.nodes, mesh.elements, still, (5, 30), (35, 30)).opening.tolist()
+    >>> still = Displacement.in_plane(zero, zero, zero + 0.01, zero + 0.01)
+    >>> crack_jump(mesh.nodes, mesh.elements, still, (5, 30), (35, 30)).opening.values.tolist()
     [[0.0, 0.0, 0.0, 0.0]]
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = JumpAlong(covariance, "the crack", *start, *end)
-    return probe.read(select_nodes(displacement, probe.nodes))
-
-
-def select_nodes(nodal: Nodal, nodes: IntArray) -> Nodal:
-    """Displacements at some of the nodes."""
-    return Nodal.of(nodal.fields[..., nodes])
+    return probe.read(displacement.isel(node=probe.nodes))

@@ -14,8 +14,8 @@ frames have in common, cancels.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol, Self
+from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -24,111 +24,16 @@ import numpy.typing as npt
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.field import column
+from rgbmidic.field import Displacement, Field
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 SIGMA = 40.0
 """Standard deviation (px) of the paper's Gaussian filter."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Nodal:
-    """Displacement of some nodes and its standard uncertainty, each (T, m), px; NaN where not measured.
-
-    Attributes
-    ----------
-    u, v, u_std, v_std : ndarray, shape (T, m)
-        Displacement and its standard uncertainty.
-    u_bias, v_bias : ndarray, shape (T, m)
-        The part of the uncertainty that the bias of the lights leaves, which nodes near each other have in common.
-
-    Examples
-    --------
-    >>> u, zero = np.array([[0.0, 0.0], [0.5, 0.6]]), np.zeros((2, 2))
-    >>> Nodal(u=u, v=zero, u_std=zero + 0.01, v_std=zero + 0.01).u.shape  # of two nodes in two frames
-    (2, 2)
-    """
-
-    u: FloatArray
-    v: FloatArray
-    u_std: FloatArray
-    v_std: FloatArray
-    u_bias: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-    v_bias: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-
-    @classmethod
-    def of(cls, fields: FloatArray) -> Self:
-        """Take all fields in one array.
-
-        Parameters
-        ----------
-        fields : ndarray, shape (6, T, m) or (4, T, m)
-            The fields in the order of the attributes; without the last two, nothing is left by the bias of lights.
-
-        Returns
-        -------
-        Nodal
-        """
-        return cls(**dict(zip(cls.__dataclass_fields__, fields, strict=False)))
-
-    @property
-    def fields(self) -> FloatArray:
-        """All of them in their order, (6, T, m)."""
-        arrays = (self.u, self.v, self.u_std, self.v_std, self.u_bias, self.v_bias)
-        return np.stack(np.broadcast_arrays(*arrays))
-
-    @property
-    def components(self) -> FloatArray:
-        """Value, uncertainty and bias of u and of v, (2, 3, T, m)."""
-        return self.fields.reshape(3, 2, *self.u.shape).swapaxes(0, 1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class History:
-    """One quantity over the frames.
-
-    Attributes
-    ----------
-    name
-        Such as ``"point_1_u"``.
-    unit
-        Of a probe ``"px"`` for a length, ``"deg"`` for an angle, empty for a strain; of a result read off in the
-        reader's units, such as ``"mm"``, ``"px/frame"``, ``"1/s"``.
-    values : ndarray, shape (T,)
-        NaN where not measured.
-    std : ndarray, shape (T,), or None
-        Standard uncertainty; None for what was not measured by the images, or has none.
-    note
-        What a reader should know of it, else empty.
-
-    Examples
-    --------
-    >>> History(name="point_1_u", unit="px", values=np.array([0.0, 0.5]), std=np.array([0.0, 0.01])).name
-    'point_1_u'
-    """
-
-    name: str
-    unit: str
-    values: FloatArray
-    std: FloatArray | None
-    note: str = ""
-
-    @property
-    def column(self) -> str:
-        """Name of its column in a table, with the unit."""
-        return column(self.name, self.unit)
-
-
-ProbeQuantity = tuple[str, str, FloatArray, FloatArray | None]
-"""Name, unit, values (T,) and standard uncertainty of a quantity that a probe measures."""
-
-
-def histories_of(probe: str, quantities: Iterable[ProbeQuantity], note: str = "") -> list[History]:
-    """Return the histories of a probe, named by it and their quantity, with one note."""
-    return [
-        History(name=f"{probe}_{name}", unit=unit, values=values, std=std, note=note)
-        for name, unit, values, std in quantities
-    ]
+def of_probe(probe: str, quantities: Iterable[Field], note: str = "") -> list[Field]:
+    """Return what a probe measures over the frames, named by the probe and the quantity, with one note."""
+    return [replace(field, name=f"{probe}_{field.name}", dims=("frame",), note=note) for field in quantities]
 
 
 class Probe(Protocol):
@@ -146,8 +51,9 @@ class Probe(Protocol):
     >>> class Midpoint:
     ...     name, nodes = "middle", np.array([4])
     ...
-    ...     def histories(self, displacement: Nodal) -> tuple[History, ...]:
-    ...         return (History(name="middle_u", unit="px", values=displacement.u[:, 0], std=None),)
+    ...     def histories(self, displacement: Displacement) -> list[Field]:
+    ...         u = displacement.isel(node=0).components[0]
+    ...         return [replace(u, name="middle_u")]
     >>> probe: Probe = Midpoint()
     """
 
@@ -159,55 +65,19 @@ class Probe(Protocol):
     def nodes(self) -> IntArray:
         """Nodes that it needs."""
 
-    def histories(self, nodal: Nodal) -> list[History]:
+    def histories(self, displacement: Displacement) -> list[Field]:
         """Compute its histories from the displacements of its `nodes`.
 
         Parameters
         ----------
-        nodal
-            Displacements of its `nodes` in every frame.
+        displacement
+            Of its `nodes` in every frame, shape (c, T, m).
 
         Returns
         -------
-        list of History
+        list of Field
+            Each of the shape (T,).
         """
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rates:
-    """A quantity over time, smoothed, with its derivatives, each of the shape (T, ...) of what was measured.
-
-    Attributes
-    ----------
-    value, velocity, acceleration : ndarray, shape (T, ...)
-        With their standard uncertainties `value_std` and so on: that of noise, and that of where the motion changes. At
-        a kink velocity and acceleration lie between those of both sides, and the uncertainty reaches to either.
-    velocity_before, velocity_after, acceleration_before, acceleration_after : ndarray, shape (T, ...)
-        From the frames up to this one, and from this one on, with their standard uncertainties; NaN but in frames where
-        they differ by more than four times these, that is, at kinks.
-
-    Examples
-    --------
-    >>> times = np.arange(20) * 1e-3
-    >>> result = rates(times, 50 * times, np.full(20, 0.01), window=10, common_fraction=0.0, references=[False] * 20)
-    >>> result.velocity.shape == result.velocity_std.shape == (20,)
-    True
-    """
-
-    value: FloatArray
-    value_std: FloatArray
-    velocity: FloatArray
-    velocity_std: FloatArray
-    acceleration: FloatArray
-    acceleration_std: FloatArray
-    velocity_before: FloatArray
-    velocity_before_std: FloatArray
-    velocity_after: FloatArray
-    velocity_after_std: FloatArray
-    acceleration_before: FloatArray
-    acceleration_before_std: FloatArray
-    acceleration_after: FloatArray
-    acceleration_after_std: FloatArray
 
 
 _POWERS = {"value": 0, "velocity": 1, "acceleration": 2} | {
@@ -246,13 +116,12 @@ def rate_words(window: int, measured: int) -> str:
 @checked
 def rates(
     times: npt.ArrayLike,
-    values: npt.ArrayLike,
-    std: npt.ArrayLike,
+    field: Field,
     *,
     window: float,
     common_fraction: float,
     references: Sequence[bool] | BoolArray,
-) -> Rates:
+) -> dict[str, Field]:
     """Estimate value, velocity and acceleration of a quantity that is measured in every frame.
 
     Next to a change of the motion, and at both ends of the test, a window keeps its length and the polynomial is taken
@@ -264,8 +133,8 @@ def rates(
     ----------
     times : (T,)
         Of the frames, rising.
-    values, std : (T, ...)
-        What was measured, and its standard uncertainty; NaN where it was not.
+    field
+        What was measured, and its standard uncertainty, shape (T, ...); NaN where it was not.
     window
         Length of time that the fit of a parabola takes in, from the first to the last frame; those of degrees 3 and 4
         take in 4/3 and 5/3 of it.
@@ -276,7 +145,12 @@ def rates(
 
     Returns
     -------
-    Rates
+    dict of str to Field
+        ``"value"``, ``"velocity"`` and ``"acceleration"``, in the unit of the field over that of the times or its
+        square. Their standard uncertainties are those of noise, and of where the motion changes: at a kink velocity and
+        acceleration lie between those of both sides, and the uncertainty reaches to either. ``"velocity_before"``,
+        ``"velocity_after"``, ``"acceleration_before"`` and ``"acceleration_after"`` are from the frames up to this one,
+        and from this one on; NaN but in frames where they differ by more than four standard uncertainties, at kinks.
         NaN in a frame whose windows have fewer known values than a parabola has coefficients, in a frame that lies
         beyond the known ones of its window, and where fewer than 4 frames are known at all.
 
@@ -288,11 +162,14 @@ def rates(
     Examples
     --------
     >>> times = np.arange(20) * 1e-3
-    >>> result = rates(times, 50 * times, np.full(20, 0.01), window=10, common_fraction=0.0, references=[False] * 20)
-    >>> result.velocity[10].round(6), result.acceleration[10].round(6) + 0
+    >>> position = Field(name="u", values=50 * times, std=np.full(20, 0.01))
+    >>> result = rates(times, position, window=10, common_fraction=0.0, references=[False] * 20)
+    >>> result["velocity"].values[10].round(6), result["acceleration"].values[10].round(6) + 0
     (np.float64(50.0), np.float64(0.0))
     """
-    frame_times, quantity, error = (np.asarray(array, dtype=np.float64) for array in (times, values, std))
+    frame_times, quantity, error = (
+        np.asarray(array, dtype=np.float64) for array in (times, field.values, field.uncertainty)
+    )
     references = np.asarray(references, dtype=bool)
     if not (frame_times.ndim == references.ndim == 1 and quantity.ndim and frame_times.size):
         raise InputError(f"rates need times (T,) and references (T,), not {frame_times.shape} and {references.shape}")
@@ -326,9 +203,10 @@ def rates(
         )
     out[:, :, 3:] = np.where(kink[:, None, None], out[:, :, 3:], np.nan)
     by_quantity = out.transpose(1, 2, 3, 0).reshape(2, len(_POWERS), *quantity.shape)
-    return Rates(
-        **{f"{name}{end}": by_quantity[j, i] for i, name in enumerate(_POWERS) for j, end in enumerate(("", "_std"))}
-    )
+    return {
+        name: replace(field, name=name, values=by_quantity[0, i], std=by_quantity[1, i], bias=None)
+        for i, name in enumerate(_POWERS)
+    }
 
 
 def _noise(

@@ -21,15 +21,19 @@ from typing import Any, Self
 import numpy as np
 import scipy.sparse as sp
 from numpy.polynomial import Chebyshev, Polynomial
+from scipy.spatial.transform import Rotation
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
 from rgbmidic.illumination.displacement import BIAS_CORRELATION_RANGE
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
+_ABOUT_AXES = -np.array([[[(i - j) * (j - k) * (k - i) / 2 for j in range(3)] for i in range(3)] for k in range(3)])
+"""Of each axis of space the matrix whose product with an arm is the velocity of a rotation about it."""
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 
@@ -52,6 +56,8 @@ class NodalCovariance:
     bias : csr_matrix, shape (n, S)
         Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
         ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
+    surface : ndarray, shape (n, 3), or None
+        Places of the n nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
 
     Examples
     --------
@@ -65,6 +71,7 @@ class NodalCovariance:
     mesh: Tri3Mesh
     fit: sp.csr_matrix
     bias: sp.csr_matrix
+    surface: FloatArray | None = None
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
@@ -87,6 +94,11 @@ class NodalCovariance:
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
         fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
         return cls(mesh=mesh, fit=unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
+
+    @property
+    def points(self) -> FloatArray:
+        """Places of the mesh's nodes, in space where they are known there."""
+        return self.mesh.nodes if self.surface is None else self.surface
 
     @property
     def correlation(self) -> sp.csr_matrix:
@@ -152,6 +164,44 @@ class NodalCovariance:
         """
         return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
 
+    def of_sums(self, weights: FloatArray, displacement: Displacement) -> FloatArray:
+        """Compute the covariance of S weighted sums of each of the c components of a displacement.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (..., S, n)
+            Of the nodes.
+        displacement
+            Of the n nodes, shape (c, ..., n).
+
+        Returns
+        -------
+        ndarray, shape (..., c S, c S)
+            Sums of the first component, then those of the next.
+        """
+        std, count = displacement.uncertainty[..., None, :], len(displacement.values)
+        if displacement.covariance is None:
+            bias = np.zeros_like(std) if displacement.bias is None else displacement.bias[..., None, :]
+            errors = [self.errors(weights, *terms) for terms in zip(std, bias, strict=True)]
+            blocks = [array @ np.swapaxes(array, -1, -2) for array in errors]
+            sums = weights.shape[-2]
+            covariance = np.zeros((*weights.shape[:-2], count, sums, count, sums))
+            for row, block in enumerate(blocks):
+                covariance[..., row, :, row, :] = block
+            return covariance.reshape(*weights.shape[:-2], count * sums, count * sums)
+        matrix = np.moveaxis(np.nan_to_num(displacement.covariance), (0, 1), (-2, -1))
+        variances, axes = np.linalg.eigh(matrix)
+        # the symmetric root: it changes as little from node to node as the covariance does
+        root = (axes * np.sqrt(np.maximum(variances, 0))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+        factor = np.moveaxis(root, (-2, -1), (0, 1))[..., None, :]
+        shared = np.zeros_like(std) if displacement.bias is None else displacement.bias[..., None, :]
+        total = np.nan_to_num((std**2).sum(axis=0))
+        share = np.divide((shared**2).sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
+        terms = np.ones_like(share), np.sqrt(share)
+        rows = [[self.errors(weights * part, *terms) for part in row] for row in factor]
+        flat = np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
+        return np.asarray(flat @ np.swapaxes(flat, -1, -2))
+
     def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
         """Return the covariance of quantities (n,), each over its standard uncertainty.
 
@@ -180,7 +230,8 @@ class NodalCovariance:
         NodalCovariance
         """
         fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
-        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
+        surface = None if self.surface is None else self.surface[nodes]
+        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)], surface=surface)
 
 
 def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
@@ -329,41 +380,41 @@ class RigidMotion:
 
     Attributes
     ----------
-    centre : ndarray, shape (2,)
-        Middle of the measured nodes on the reference, px: the shift is that of this point.
-    shift, shift_std : ndarray, shape (2,)
-        In px.
-    rotation, rotation_std : float
-        In rad, from x towards y.
+    centre : ndarray, shape (c,)
+        Middle of the measured nodes on the reference: the shift is that of this point.
+    shift
+        In the unit of the displacement, shape (c,).
+    rotation
+        In rad: in the plane from x towards y, a number; in space the rotation vector, shape (3,).
+    back : ndarray, shape (c, c)
+        Rotation by the opposite angle.
 
     Examples
     --------
     >>> from rgbmidic.mesh import Region
     >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
     >>> zero = np.zeros(len(mesh.nodes))
-    >>> motion = RigidMotion.of(NodalCovariance.from_mesh(mesh), zero + 1, zero, zero + 0.01, zero + 0.01)
-    >>> motion.shift.round(6).tolist()
+    >>> shifted = Displacement.in_plane(zero + 1, zero, zero + 0.01, zero + 0.01)
+    >>> motion = RigidMotion.of(NodalCovariance.from_mesh(mesh), shifted)
+    >>> motion.shift.values.round(6).tolist()
     [1.0, 0.0]
     """
 
     centre: FloatArray
-    shift: FloatArray
-    shift_std: FloatArray
-    rotation: float
-    rotation_std: float
+    shift: Field
+    rotation: Field
+    back: FloatArray
 
     @classmethod
-    def of(cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray) -> Self:
+    def of(cls, covariance: NodalCovariance, displacement: Displacement) -> Self:
         """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
         Parameters
         ----------
         covariance
             Of the mesh.
-        u, v : ndarray, shape (N,)
-            In px; NaN where not measured.
-        *std : ndarray, shape (N,)
-            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
+        displacement
+            Of its N nodes in one frame, shape (c, N); NaN where not measured.
 
         Returns
         -------
@@ -374,67 +425,85 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, is_measured = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
+        nodes, is_measured, unit = covariance.points, displacement.is_measured, displacement.unit
         if is_measured.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
         centre = nodes[is_measured].mean(axis=0)
-        arm, displacement = nodes[is_measured] - centre, np.stack([u, v], axis=1)[is_measured]
-        shift = displacement.mean(axis=0)
-        deformed = arm + displacement - shift
-        along, turned = (arm * deformed).sum(), (arm[:, 0] * deformed[:, 1] - arm[:, 1] * deformed[:, 0]).sum()
-        equal_weights = is_measured / is_measured.sum()
-        lever, angle = np.zeros((2, len(nodes))), float(np.arctan2(turned, along))
-        # d(angle) = sum of (arm, turned along) x d(moved) / (arm . there)
-        c, s = np.cos(angle), np.sin(angle)
-        lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
-        lever /= np.hypot(along, turned)
-        u_std, v_std = std[::2], std[1::2]
-        turning = covariance.variance(lever[0], *u_std) + covariance.variance(lever[1], *v_std)
+        arm, values = nodes[is_measured] - centre, displacement.values.T[is_measured]
+        shift = values.mean(axis=0)
+        left, _, right = np.linalg.svd(arm.T @ (arm + values - shift))
+        right[-1] *= np.sign(np.linalg.det(left @ right))  # no reflection
+        back = left @ right
+        # an error of the rotation is the sum of the levers, the turned arms across the axes, times the errors
+        turned, count = arm @ back, len(centre)
+        axes = _ABOUT_AXES if count == 3 else _ABOUT_AXES[2:, :2, :2]
+        normal = np.einsum("kij,lih,nj,nh->kl", axes, axes, turned, turned)
+        by_sums = np.zeros((count + len(axes), count, 1 + count))
+        by_sums[:count, :, 0] = np.eye(count)
+        by_sums[count:, :, 1:] = np.einsum("kl,lij->kij", np.linalg.pinv(normal), axes)
+        weights = np.zeros((1 + count, len(nodes)))
+        weights[:, is_measured] = np.vstack([np.full(len(arm), 1 / len(arm)), turned.T])
+        by_sums = by_sums.reshape(count + len(axes), -1)
+        std = np.sqrt(np.einsum("ka,ab,kb->k", by_sums, covariance.of_sums(weights, displacement), by_sums))
+        rotation = Rotation.from_matrix(back.T).as_rotvec() if count == 3 else np.arctan2(back[0, 1], back[0, 0])
         return cls(
             centre=centre,
-            shift=shift,
-            shift_std=np.sqrt(
-                np.array([covariance.variance(equal_weights, *component_std) for component_std in (u_std, v_std)])
+            shift=Field(name="rigid", unit=unit, dims=("component",), values=shift, std=std[:count]),
+            rotation=Field(
+                name="rigid_rotation",
+                unit="rad",
+                dims=("component",)[: np.ndim(rotation)],
+                values=np.asarray(rotation),
+                std=std[count:].reshape(np.shape(rotation)),
             ),
-            rotation=angle,
-            rotation_std=float(np.sqrt(turning)),
+            back=back,
         )
 
-    def removed(self, nodes: FloatArray, field: FloatArray) -> FloatArray:
+    def removed(self, nodes: FloatArray, displacement: Displacement) -> Displacement:
         """Subtract the rigid motion from a displacement field: the field in axes that move with the body.
 
         The remaining displacements are rotated back, so that lengths and strains stay as they are.
 
         Parameters
         ----------
-        nodes : ndarray, shape (N, 2)
-            In px on the reference.
-        field : ndarray, shape (4, N) or (6, N)
-            u, v, their standard uncertainty, and the part that the lights' bias leaves, px. The uncertainty of the
-            rigid motion itself is not added: it is the less, the more nodes there are.
+        nodes : ndarray, shape (N, c)
+            On the reference, in the unit of the displacement.
+        displacement
+            Of the shape (c, N). The uncertainty of the rigid motion itself is not added: it is the less, the more nodes
+            there are.
 
         Returns
         -------
-        ndarray, shape (4, N) or (6, N)
-            As `field`.
+        Displacement
         """
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        back = np.array([[c, s], [-s, c]])
-        arm = nodes - self.centre
-        remaining = (arm + field[:2].T - self.shift) @ back.T - arm
-        return np.concatenate([remaining.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
+        arm, covariance = nodes - self.centre, displacement.covariance
+        turned = replace(displacement, covariance=None).with_arrays(lambda std: np.sqrt(self.back**2 @ std**2))
+        if covariance is not None:
+            covariance = np.einsum("ia,abn,jb->ijn", self.back, covariance, self.back)
+            turned = replace(turned, covariance=covariance, std=np.sqrt(np.einsum("iin->in", covariance)))
+        remaining = (arm + displacement.values.T - self.shift.values) @ self.back.T - arm
+        return replace(turned, values=remaining.T)
+
+    @property
+    def components(self) -> tuple[Field, ...]:
+        """Shift along each axis, and rotation in degrees, about each axis of space."""
+        degrees = replace(self.rotation.with_arrays(np.degrees), unit="deg")
+        parts = [(f"rigid_{name}", self.shift, row) for row, name in enumerate("uvw"[: len(self.centre)])]
+        if not degrees.values.ndim:
+            return (*(replace(field.isel(component=row), name=name) for name, field, row in parts), degrees)
+        parts += [(f"rigid_rotation_{name}", degrees, row) for row, name in enumerate("xyz")]
+        return tuple(replace(field.isel(component=row), name=name) for name, field, row in parts)
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.
+        """Compute the displacement (P, c) of points (P, c) by the rigid motion alone.
 
         Parameters
         ----------
-        points : ndarray, shape (P, 2)
-            Points (x, y) on the reference, px.
+        points : ndarray, shape (P, c)
+            Points on the reference, in the unit of the displacement.
 
         Returns
         -------
-        ndarray, shape (P, 2)
+        ndarray, shape (P, c)
         """
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)
+        return np.asarray((points - self.centre) @ (self.back - np.eye(len(self.centre))) + self.shift.values)

@@ -20,6 +20,7 @@ import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.field import Displacement
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import has_schema, read_document, write_document
 from rgbmidic.illumination.images import Registration
@@ -564,25 +565,23 @@ class Rectification:
         ends = np.array(coordinates[: 2 * points], dtype=np.float64).reshape(-1, 2)
         return (*(self.camera.to_mm(ends) / self.units.mm_per_pixel).ravel().tolist(), *coordinates[2 * points :])
 
-    def displacement(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, ...]:
-        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN.
+    def displacement(self, displacement: Displacement) -> Displacement:
+        """Rectify the displacement of every node and its standard uncertainty; NaN stays NaN.
 
         Parameters
         ----------
-        u, v : ndarray, shape (N,)
-            Displacement, px of the image.
-        *std : ndarray, shape (N,)
-            Its standard uncertainty along x and y, and any part of that, one after the other.
+        displacement
+            In px of the image, shape (2, N).
 
         Returns
         -------
-        tuple of ndarray, shape (N,)
+        Displacement
             The same in rectified px.
         """
         if self.camera is None or self.units.mm_per_pixel is None:
-            return u, v, *std
-        deformed = self.image.nodes + np.stack([u, v], axis=1)
+            return displacement
+        deformed = self.image.nodes + displacement.values.T
         along = self.camera.to_mm(deformed) / self.units.mm_per_pixel - self.mesh.nodes
-        slopes = self.camera.jacobian(deformed) / self.units.mm_per_pixel
-        square = np.square(std, dtype=np.float64).reshape(-1, 2, len(u))
-        return *along.T, *np.sqrt(np.einsum("nij,sjn->sin", slopes**2, square)).reshape(-1, len(u))
+        squares = (self.camera.jacobian(deformed) / self.units.mm_per_pixel) ** 2
+        turned = displacement.with_arrays(lambda std: np.sqrt(np.einsum("nij,jn->in", squares, std**2)))
+        return replace(turned, values=along.T)

@@ -8,7 +8,7 @@ those on the reference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,12 +17,14 @@ import numpy.typing as npt
 
 from rgbmidic import extensions
 from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.cracks import JumpAlong
-from rgbmidic.fields.history import History, Nodal, Probe, histories_of
+from rgbmidic.fields.history import Probe, of_probe
 from rgbmidic.fields.interpolation import MeshPoints, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.tangent_plane import in_tangent_plane
 from rgbmidic.fields.units import Units
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
@@ -132,25 +134,26 @@ class Mean:
         """See `Probe`."""
         return self.sum.nodes
 
-    def histories(self, nodal: Nodal) -> list[History]:
-        """Compute u and v in px.
+    def histories(self, displacement: Displacement) -> list[Field]:
+        """Compute each component of the displacement.
 
         Parameters
         ----------
-        nodal
-            Displacements of its `nodes` in every frame.
+        displacement
+            Of its `nodes` in every frame, shape (c, T, m).
 
         Returns
         -------
-        list of History
+        list of Field
         """
-        weights, measured = self.weights(_has_data(nodal))
-        return self._displacement_histories(nodal, weights[:, 0], measured)
+        weights, measured = self.weights(displacement.is_measured)
+        return self._displacement_histories(displacement, weights[:, 0], measured)
 
-    def _displacement_histories(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
-        u, v = (self.average(weights, *component) for component in nodal.components)
+    def _displacement_histories(
+        self, displacement: Displacement, weights: FloatArray, measured: FloatArray
+    ) -> list[Field]:
         note = _coverage_note(self.name, "mean", self.sum.inside * measured)
-        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
+        return of_probe(self.name, [self.average(weights, one) for one in displacement.components], note)
 
     def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, FloatArray]:
         """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
@@ -178,40 +181,44 @@ class Mean:
                 weights[row], measured[row] = sums / fraction, fraction
         return weights[frame.ravel()], measured[frame.ravel()]
 
-    def average(
-        self, weights: FloatArray, values: FloatArray, std: FloatArray, bias: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Average a quantity (T, m) of the nodes, with its standard uncertainty, each (T,).
-
-        The errors are correlated between nodes as those of a displacement; of another quantity, without a `bias`, they
-        are taken as the same at all nodes, which is the most that they can add up to.
+    def average(self, weights: FloatArray, field: Field) -> Field:
+        """Average a component of the displacement over the nodes.
 
         Parameters
         ----------
         weights : ndarray, shape (T, m)
             Of the nodes, see `weights`.
-        values, std : ndarray, shape (T, m)
-            The quantity and its standard uncertainty.
-        bias : ndarray, shape (T, m)
-            The part of a displacement's uncertainty that the lights' bias leaves.
+        field
+            Of the nodes, shape (T, m).
 
         Returns
         -------
-        values, std : ndarray, shape (T,)
+        Field
+            Of the shape (T,).
         """
-        mean = _products(weights, values).sum(axis=1)
-        if bias is None:
-            return mean, _products(weights, std).sum(axis=1)
-        return mean, np.sqrt(self.covariance.variance(weights, std, bias))
+        variance = self.covariance.variance(weights, field.uncertainty, 0.0 if field.bias is None else field.bias)
+        mean = _products(weights, field.values).sum(axis=1)
+        return replace(field, dims=("frame",), values=mean, std=np.sqrt(variance), bias=None)
+
+    def average_bound(self, weights: FloatArray, field: Field) -> Field:
+        """Average another quantity, whose errors are taken as the same at all nodes: the most that they can add up to.
+
+        Parameters
+        ----------
+        weights, field
+            As of `average`.
+
+        Returns
+        -------
+        Field
+        """
+        mean = replace(field, bias=None).with_arrays(lambda array: _products(weights, array).sum(axis=1))
+        return replace(mean, dims=("frame",))
 
 
 def _products(weights: FloatArray, values: FloatArray) -> FloatArray:
     """Multiply values (T, m) by weights; those of the weight 0, which may be NaN, give 0."""
     return np.multiply(weights, values, out=np.zeros(weights.shape), where=weights != 0)
-
-
-def _has_data(nodal: Nodal) -> BoolArray:
-    return np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
 
 
 def _coverage_note(name: str, quantity: str, coverage: FloatArray) -> str:
@@ -271,21 +278,23 @@ class Gauge:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
         self._relative = Mean.over(covariance, name, ends, factors=(-1, 1))
         self.nodes = self._relative.nodes
+        if covariance.surface is not None:
+            weights = self._relative.weights(np.ones((1, len(self.nodes)), dtype=bool))[0]
+            self.arm = weights[0, 0] @ covariance.surface[self.nodes]
 
-    def histories(self, nodal: Nodal) -> list[History]:
-        """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length, weights = float(np.hypot(*self.arm)), self._relative.weights(_has_data(nodal))[0][:, 0]
-        relative_displacement, spread = np.stack(
-            [self._relative.average(weights, *component) for component in nodal.components], axis=2
-        )
-        deformed_arm = (
-            self.arm + relative_displacement if self.moving else np.broadcast_to(self.arm, relative_displacement.shape)
-        )
-        towards = deformed_arm / np.hypot(*deformed_arm.T)[:, None]
-        extension = np.hypot(*deformed_arm.T) - length if self.moving else (towards * relative_displacement).sum(axis=1)
-        std = np.hypot(*(towards * spread).T)
-        quantities = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
-        return histories_of(self.name, quantities)
+    def histories(self, displacement: Displacement) -> list[Field]:
+        """Compute the extension and the strain from the displacements of its `nodes` in every frame."""
+        weights, length = self._relative.weights(displacement.is_measured)[0], float(np.linalg.norm(self.arm))
+        relative = np.stack([_products(weights[:, 0], values).sum(axis=1) for values in displacement.values], axis=1)
+        covariance = self._relative.covariance.of_sums(weights, displacement)
+        deformed_arm = self.arm + relative if self.moving else np.broadcast_to(self.arm, relative.shape)
+        deformed_length = np.linalg.norm(deformed_arm, axis=1)
+        towards = deformed_arm / deformed_length[:, None]
+        values = deformed_length - length if self.moving else (towards * relative).sum(axis=1)
+        std = np.sqrt(np.einsum("ta,tab,tb->t", towards, covariance, towards))
+        extension = Field(name="extension", unit=displacement.unit, values=values, std=std)
+        strain = replace(extension.with_arrays(lambda array: array / length), name="strain", unit="")
+        return of_probe(self.name, [extension, strain])
 
 
 class StrainGauge:
@@ -321,37 +330,28 @@ class StrainGauge:
         if self.inside < _CONSTANTS.min_fraction - _CONSTANTS.edge:
             raise InputError(f"half or more of {name} is outside {mesh_points.bounds_text}")
 
-    def histories(self, nodal: Nodal) -> list[History]:
-        """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame.
+    def histories(self, displacement: Displacement) -> list[Field]:
+        """Compute every quantity of the strain from the displacements of its `nodes` in every frame.
 
         They are NaN where less than half of the nodes, as they count, is measured.
         """
-        patterns, frame = np.unique(has_data := _has_data(nodal), axis=0, return_inverse=True)
+        patterns, frame = np.unique(has_data := displacement.is_measured, axis=0, return_inverse=True)
         slopes = np.stack([self.gauges.weights(pattern) for pattern in patterns])[frame.ravel()]
         measured_fraction = has_data[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
         slopes[measured_fraction < _CONSTANTS.min_fraction - _CONSTANTS.rounding] = np.nan
-        strain = _strain(slopes, nodal, self.covariance, self.measure)
-        coverage = np.where(np.isfinite(strain.components[:, 0]), measured_fraction, 1.0)
-        return _strain_histories(self.name, strain, _coverage_note(self.name, "strain", self.inside * coverage))
+        strain = _strain(slopes, displacement, self.covariance, self.measure)
+        coverage = np.where(np.isfinite(strain["exx"].values), measured_fraction, 1.0)
+        return of_probe(self.name, strain.values(), _coverage_note(self.name, "strain", self.inside * coverage))
 
 
-def _strain(slopes: FloatArray, nodal: Nodal, covariance: NodalCovariance, measure: str) -> Strain:
+def _strain(slopes: FloatArray, displacement: Displacement, covariance: NodalCovariance, measure: str) -> Strain:
     """Compute the strain (T,) of the displacement gradient that weights (T, 2, m) of the nodes give."""
-    gradient, spread = np.zeros((len(slopes), 2, 2)), np.zeros((len(slopes), 4, 4))
-    for row, (value, std, bias) in enumerate(nodal.components[:, :, :, None]):
-        gradient[:, row] = _products(slopes, value).sum(axis=2)
-        errors, block = covariance.errors(slopes, std, bias), slice(2 * row, 2 * row + 2)
-        spread[:, block, block] = errors @ errors.swapaxes(1, 2)
+    gradient = np.stack([_products(slopes, values[:, None]).sum(axis=2) for values in displacement.values], axis=1)
+    spread = covariance.of_sums(slopes, displacement)
+    if covariance.surface is not None:
+        tangents = np.stack([_products(slopes, nodes).sum(axis=2) for nodes in covariance.surface.T], axis=1)
+        gradient, spread = in_tangent_plane(tangents, gradient, spread)
     return strain_of_gradient(gradient, spread, measure)
-
-
-def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
-    """Return every quantity of a strain (T,) as a history."""
-    values = [*strain.components.T, *strain.principal.T, strain.direction_deg, strain.equivalent]
-    stds = [*strain.components_std.T, *strain.principal_std.T, strain.direction_std_deg, strain.equivalent_std]
-    names = "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"
-    units = ("deg" if quantity == "direction" else "" for quantity in names)
-    return histories_of(name, zip(names, units, values, stds, strict=True), note)
 
 
 class Area(Mean):
@@ -394,22 +394,22 @@ class Area(Mean):
         )
         self.measure = measure
 
-    def histories(self, nodal: Nodal) -> list[History]:
-        """Compute u and v in px, then strain, principal strains and equivalent strain.
+    def histories(self, displacement: Displacement) -> list[Field]:
+        """Compute each component of the displacement, then every quantity of the strain.
 
         Parameters
         ----------
-        nodal
-            Displacements of its `nodes` in every frame.
+        displacement
+            Of its `nodes` in every frame, shape (c, T, m).
 
         Returns
         -------
-        list of History
+        list of Field
         """
-        weights, measured = self.weights(_has_data(nodal))
-        displacements = self._displacement_histories(nodal, weights[:, 0], measured)
-        strain = _strain(weights[:, 1:], nodal, self.covariance, self.measure)
-        return [*displacements, *_strain_histories(self.name, strain, displacements[0].note)]
+        weights, measured = self.weights(displacement.is_measured)
+        means = self._displacement_histories(displacement, weights[:, 0], measured)
+        strain = _strain(weights[:, 1:], displacement, self.covariance, self.measure)
+        return [*means, *of_probe(self.name, strain.values(), means[0].note)]
 
 
 PROBES: dict[str, tuple[int, int, Callable[..., Probe] | None]] = {
@@ -468,7 +468,7 @@ def make_probe(
     >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
     >>> gauge = make_probe(NodalCovariance.from_mesh(mesh), "gauge", 1, (20, 30, 60, 30))
     >>> zero = np.zeros((2, len(gauge.nodes)))
-    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
+    >>> still = Displacement.in_plane(zero, zero, zero + 0.01, zero + 0.01)
     >>> [(history.name, history.values.tolist()) for history in gauge.histories(still)][:1]
     [('gauge_1_extension', [0.0, 0.0])]
     """

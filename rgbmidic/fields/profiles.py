@@ -11,7 +11,7 @@ between the positions; the speed is that of the straight line through the arriva
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 
@@ -21,6 +21,7 @@ import scipy.sparse as sp
 from scipy.special import chdtrc
 
 from rgbmidic.errors import InputError
+from rgbmidic.field import Field
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.strain import StrainGauges
@@ -120,8 +121,10 @@ class ProfileLine:
     ----------
     points : ndarray, shape (P, 2)
         In px on the reference, from the first end to the last.
+    surface : ndarray, shape (P, 3), or None
+        Where the points are on a surface in space, NaN outside of it; None: it is in the mesh's plane.
     positions : ndarray, shape (P,)
-        Distance from the first end, px.
+        Distance from the first end, px, or along the surface in its unit.
     nodes : ndarray, shape (n,), int
         Nodes around the line.
     mesh_points
@@ -168,6 +171,11 @@ class ProfileLine:
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.mesh_points = mesh_points.nearby()
+        self.surface = None if covariance.surface is None else mesh_points.read(covariance.surface)
+        if self.surface is not None:
+            steps_in_space = np.linalg.norm(np.diff(self.surface, axis=0), axis=1)
+            outside = np.nanmedian(steps_in_space)  # the surface is not known there
+            self.positions = np.append(0.0, np.cumsum(np.where(np.isfinite(steps_in_space), steps_in_space, outside)))
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
         nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
@@ -179,30 +187,28 @@ class ProfileLine:
         at_corners = lopsided[mesh.elements[mesh_points.element]]
         self.is_two_sided = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
 
-    def read(
-        self, values: FloatArray, std: FloatArray, kind: str = "", bias: FloatArray | float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).
+    def read(self, field: Field, kind: str = "") -> Field:
+        """Interpolate a nodal field and its standard uncertainty at the points.
 
         Parameters
         ----------
-        values, std : ndarray, shape (N,)
-            Of the mesh; NaN where not measured.
+        field
+            At all nodes of the mesh, shape (N,); NaN where not measured.
         kind
             Key of `covariances`.
-        bias : ndarray, shape (N,)
-            The part of the uncertainty that the lights' bias leaves.
 
         Returns
         -------
-        values, std : ndarray, shape (P,)
-            NaN where a node around is not measured.
+        Field
+            Of the shape (P,); NaN where a node around is not measured.
         """
-        values, std, bias = (array[self.nodes] for array in np.broadcast_arrays(values, std, bias))
-        weights = self._weights(np.isfinite(values).tobytes())
-        interpolated = weights @ np.nan_to_num(values)
-        variance = self.covariances[kind].variance(np.nan_to_num(weights), std, bias)
-        return interpolated, np.where(np.isfinite(interpolated), np.sqrt(variance), np.nan)
+        near = field.isel(node=self.nodes)
+        weights = self._weights(np.isfinite(near.values).tobytes())
+        values = weights @ np.nan_to_num(near.values)
+        bias = 0.0 if near.bias is None else near.bias
+        std = np.sqrt(self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, bias))
+        std = np.where(np.isfinite(values), std, np.nan)
+        return replace(field, dims=("position",), values=values, std=std, bias=None)
 
     def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.

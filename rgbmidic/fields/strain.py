@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +23,14 @@ import scipy.sparse as sp
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
+from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.tangent_plane import in_tangent_plane
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
+from rgbmidic.settings.schema import STRAIN_MEASURES
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 SHORTEST = 3.0
@@ -34,19 +38,14 @@ SHORTEST = 3.0
 _MARGIN = SHORTEST - 2 * np.sqrt(2)
 """Elements by which a gauge is longer than to the farthest node of the elements around its centre: nothing on a regular
 mesh, where that is at the root of 2. At an edge, a gauge that did not hold these would hold the nodes of a line."""
-_Function = Callable[[FloatArray], FloatArray]
-_OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
-    "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),
-    "hencky": (lambda c: np.log(c) / 2, lambda c: 0.5 / c),
-    "biot": (lambda c: np.sqrt(c) - 1, lambda c: 0.5 / np.sqrt(c)),
-}
-"""Each measure as a function of an eigenvalue of C, and its derivative."""
-MEASURES = (*_OF_STRETCH, "engineering")
+MEASURES = tuple(STRAIN_MEASURES)
 """Names of the strain measures; the first is the default."""
-_SMALL = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [0, 0.5, 0.5, 0]])
-"""Derivative of the small exx, eyy, exy by the gradient."""
 _LARGEST_ANGLE = np.degrees(np.pi / np.sqrt(12))
 """Standard uncertainty (degrees) of a direction of which nothing is known."""
+_SMALL = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [0, 0.5, 0.5, 0]])
+"""Derivative of the small exx, eyy, exy by the gradient."""
+_SPLIT = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])
+"""exx - eyy and 2 exy, whose length is e1 - e2."""
 _EQUIVALENT = np.array([[4 / 3, 2 / 3, 0], [2 / 3, 4 / 3, 0], [0, 0, 4 / 3]])
 """``e^T A e`` for the Hencky strain e = (exx, eyy, exy) is the square of the von Mises equivalent at constant volume:
 only there is constant volume ``e1 + e2 + e3 = 0``, so that the third principal strain is known."""
@@ -55,47 +54,112 @@ EQUIVALENT = "von Mises equivalent of the Hencky strain, for a material of const
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Strain:
-    """Strain at some places, in the axes x, y of the reference; NaN where it is not measured.
+class _Tensors:
+    """Strain tensors (n) of which the quantities are functions.
 
     Attributes
     ----------
-    measure
-        One of `MEASURES`.
-    components, components_std : ndarray, shape (..., 3)
-        exx, eyy, exy (tensor shear) and their standard uncertainty.
-    principal, principal_std : ndarray, shape (..., 2)
-        The larger and the smaller principal strain, in the plane.
-    direction_deg, direction_std_deg : ndarray, shape (...)
-        Direction of the larger one on the reference, from x towards y, between -90 and 90 degrees. Where both are the
-        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain.
-    equivalent, equivalent_std : ndarray, shape (...)
-        Von Mises equivalent of the Hencky strain at constant volume, ``sqrt(4/3 (h1^2 + h1 h2 + h2^2))``, whatever
-        `measure` is: ``ln`` of the stretch in a tensile test. Where the volume changes it is another number: in tension
-        with a Poisson ratio of .3 it is 2.6 % too large. Being positive, it is more than 0 in noise alone, by about
-        its uncertainty.
-    shear, shear_std : ndarray, shape (...)
-        Largest shear angle in the plane, ``e1 - e2``: engineering shear, twice the tensor's. Positive, see `length_of`.
+    components, covariance : ndarray, shape (n, 3) and (n, 3, 3)
+        exx, eyy, exy in the stated measure.
+    hencky, hencky_covariance
+        The same of the Hencky strain.
+    principal : ndarray, shape (n, 2)
+        The larger and the smaller one.
+    cosine, sine : ndarray, shape (n,)
+        Of the angle from x to the direction of the larger one.
+    """
+
+    components: FloatArray
+    covariance: FloatArray
+    hencky: FloatArray
+    hencky_covariance: FloatArray
+    principal: FloatArray
+    cosine: FloatArray
+    sine: FloatArray
+
+    def component(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Return exx, eyy or exy."""
+        return self.components[:, index], np.sqrt(np.maximum(self.covariance[:, index, index], 0))
+
+    def principal_strain(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Return e1 or e2."""
+        c, s = (self.cosine, self.sine) if index == 0 else (-self.sine, self.cosine)
+        return self.principal[:, index], _deviation(np.stack([c * c, s * s, 2 * c * s], axis=1), self.covariance)
+
+    def direction(self) -> tuple[FloatArray, FloatArray]:
+        """Return the direction of e1 in degrees."""
+        c, s, difference = self.cosine, self.sine, self.principal[:, 0] - self.principal[:, 1]
+        turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
+        degrees = np.where(difference > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = np.degrees(_deviation(turn, self.covariance) / difference)
+        return degrees, np.minimum(std, _LARGEST_ANGLE)
+
+    def shear(self) -> tuple[FloatArray, FloatArray]:
+        """Return e1 - e2."""
+        return length_of(self.components @ _SPLIT.T, _SPLIT @ self.covariance @ _SPLIT.T)
+
+    def equivalent(self) -> tuple[FloatArray, FloatArray]:
+        """Return the equivalent strain; its uncertainty is first order where large, else that of noise alone."""
+        e, covariance = self.hencky, self.hencky_covariance
+        square, slope = np.einsum("na,ab,nb->n", e, _EQUIVALENT, e), e @ _EQUIVALENT
+        noise = np.einsum("ab,nab->n", _EQUIVALENT, covariance)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first = np.einsum("na,nab,nb->n", slope, covariance, slope) / np.where(square > 0, square, np.inf)
+            large = square / (square + noise)
+        return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)
+
+
+def _entry(name: str, symbol: str, description: str, **more: Any) -> ResultQuantity:
+    return ResultQuantity(name, ("node",), more.pop("unit", ""), "", description, symbol=symbol, group="Strain", **more)
+
+
+_Function = Callable[[_Tensors], tuple[FloatArray, FloatArray]]
+_QUANTITIES: tuple[tuple[ResultQuantity, _Function], ...] = (
+    (_entry("exx", "εxx", "strain in x"), lambda tensors: tensors.component(0)),
+    (_entry("eyy", "εyy", "strain in y"), lambda tensors: tensors.component(1)),
+    (_entry("exy", "εxy", "strain, tensor shear"), lambda tensors: tensors.component(2)),
+    (_entry("e1", "ε₁", "larger principal strain in the plane"), lambda tensors: tensors.principal_strain(0)),
+    (_entry("e2", "ε₂", "smaller principal strain in the plane"), lambda tensors: tensors.principal_strain(1)),
+    (_entry("direction", "θ₁", "direction of e1, from x towards y", unit="deg", kind="angle"), _Tensors.direction),
+    (_entry("shear", "γmax", "largest engineering shear in the plane, e1 - e2", kind="positive"), _Tensors.shear),
+    (_entry("equivalent", "εeq (Hencky)", EQUIVALENT, kind="positive"), _Tensors.equivalent),
+)
+"""Every quantity of a strain, with its value and standard uncertainty (n,): records, histories, maps and exports have
+them all, in this order."""
+STRAIN: dict[str, ResultQuantity] = {entry.name: entry for entry, _ in _QUANTITIES}
+"""What the quantities of a strain are, by name."""
+
+
+class Strain(dict[str, Field]):
+    """Strain at some places, in the axes x, y of the reference: each quantity of `STRAIN` by its name.
+
+    exx, eyy, exy (tensor shear); e1 and e2, the larger and the smaller principal strain, in the plane; ``direction`` of
+    the larger one on the reference, from x towards y, between -90 and 90 degrees: where both are the same within their
+    uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain. ``shear``, the largest
+    shear angle in the plane, ``e1 - e2``: engineering shear, twice the tensor's; positive, see `length_of`.
+    ``equivalent``, the von Mises equivalent of the Hencky strain at constant volume,
+    ``sqrt(4/3 (h1^2 + h1 h2 + h2^2))``, whatever the measure is: ``ln`` of the stretch in a tensile test. Where the
+    volume changes it is another number: in tension with a Poisson ratio of .3 it is 2.6 % too large. Being positive,
+    it is more than 0 in noise alone, by about its uncertainty. NaN where the strain is not measured.
 
     Examples
     --------
     >>> stretch = np.array([[0.1, 0.0], [0.0, -0.03]])
     >>> strain = strain_of_gradient(stretch, np.zeros((4, 4)), "engineering")
-    >>> strain.components.round(6).tolist(), strain.principal.round(6).tolist()
-    ([0.1, -0.03, 0.0], [0.1, -0.03])
+    >>> strain.components.round(6).tolist(), strain["e1"].values.round(6).tolist()
+    ([0.1, -0.03, 0.0], 0.1)
     """
 
-    measure: str
-    components: FloatArray
-    components_std: FloatArray
-    principal: FloatArray
-    principal_std: FloatArray
-    direction_deg: FloatArray
-    direction_std_deg: FloatArray
-    equivalent: FloatArray
-    equivalent_std: FloatArray
-    shear: FloatArray
-    shear_std: FloatArray
+    @property
+    def components(self) -> FloatArray:
+        """Values of exx, eyy and exy, shape (..., 3)."""
+        return np.stack([self[name].values for name in ("exx", "eyy", "exy")], axis=-1)
+
+    @property
+    def components_std(self) -> FloatArray:
+        """Standard uncertainties of exx, eyy and exy, shape (..., 3)."""
+        return np.stack([self[name].uncertainty for name in ("exx", "eyy", "exy")], axis=-1)
 
 
 def length_of(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -148,7 +212,7 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     Examples
     --------
     >>> gradient = np.array([[0.1, 0.0], [0.0, 0.0]])
-    >>> strain_of_gradient(gradient, np.zeros((4, 4))).components[0].round(6)  # Green-Lagrange
+    >>> strain_of_gradient(gradient, np.zeros((4, 4)))["exx"].values.round(6)  # Green-Lagrange
     np.float64(0.105)
     """
     if measure not in MEASURES:
@@ -159,51 +223,51 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
             f"gradients (..., 2, 2) and their covariance (..., 4, 4) are needed, not {gradient.shape} and "
             f"{covariance.shape}"
         )
+    return _strain(gradient, covariance, measure)
+
+
+def _strain(gradient: FloatArray, covariance: FloatArray, measure: str) -> Strain:
+    """Compute `strain_of_gradient` of what is checked."""
+    shape = gradient.shape[:-2]
     h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
-    hencky = _of_stretch(h, *_OF_STRETCH["hencky"])
-    if measure == "engineering":
-        tensor, slopes = (h + h.transpose(0, 2, 1)) / 2, _SMALL
-    else:
-        tensor, slopes = hencky if measure == "hencky" else _of_stretch(h, *_OF_STRETCH[measure])
-    covariance, of_hencky = (slope @ spread @ np.swapaxes(slope, -1, -2) for slope in (slopes, hencky[1]))
-    principal, vectors = _eigen(tensor)
-    c, s = vectors[:, 0, 0], vectors[:, 1, 0]
-    along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
-    turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
-    split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
-    components, of_equivalent = (np.stack([t[:, 0, 0], t[:, 1, 1], t[:, 0, 1]], axis=1) for t in (tensor, hencky[0]))
-    shear, shear_std = length_of(components @ split.T, split @ covariance @ split.T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        equivalent, equivalent_std = _equivalent(of_equivalent, of_hencky)
-        principal_difference = principal[:, 0] - principal[:, 1]
-        direction_std = np.degrees(_deviation(turn, covariance) / principal_difference)
-    arrays = {
-        "components": components,
-        "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
-        "principal": principal,
-        "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
-        "direction_deg": np.where(principal_difference > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan),
-        "direction_std_deg": np.minimum(direction_std, _LARGEST_ANGLE),
-        "equivalent": equivalent,
-        "equivalent_std": equivalent_std,
-        "shear": shear,
-        "shear_std": shear_std,
-    }
-    return Strain(
-        measure=measure, **{name: array.reshape((*shape, *array.shape[1:])) for name, array in arrays.items()}
+    stated, hencky = (_strain_tensor(h, STRAIN_MEASURES[name]) for name in (measure, "hencky"))
+    (components, e_covariance), (hencky_components, hencky_covariance) = (
+        (np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1), slope @ spread @ slope.swapaxes(-1, -2))
+        for tensor, slope in (stated, hencky)
     )
+    principal, vectors = _eigen(stated[0])
+    tensors = _Tensors(
+        components=components,
+        covariance=e_covariance,
+        hencky=hencky_components,
+        hencky_covariance=hencky_covariance,
+        principal=principal,
+        cosine=vectors[:, 0, 0],
+        sine=vectors[:, 1, 0],
+    )
+    dims = ("frame", "node")[2 - len(shape) :]
+    strain = Strain()
+    for entry, function in _QUANTITIES:
+        values, std = (array.reshape(shape) for array in function(tensors))
+        strain[entry.name] = Field(name=entry.name, unit=entry.unit, dims=dims, values=values, std=std)
+    return strain
 
 
-def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
-    """Compute a function of C (n, 2, 2) and the derivative (n, 3, 4) of xx, yy, xy by H (Daleckii and Krein)."""
+def _strain_tensor(gradient: FloatArray, power: float | None) -> tuple[FloatArray, FloatArray]:
+    """Compute the strain (n, 2, 2) of gradients, and the derivative (n, 3, 4) of xx, yy, xy by H (Daleckii and Krein).
+
+    It is ``(C^m - I) / (2 m)`` with the power m of `STRAIN_MEASURES`, in the limit of 0 ``ln(C) / 2``; None: small.
+    """
+    if power is None:
+        return (gradient + gradient.transpose(0, 2, 1)) / 2, _SMALL
     f = np.eye(2) + gradient
     values, vectors = _eigen(f.transpose(0, 2, 1) @ f)
     values = np.maximum(values, np.finfo(float).tiny)
-    at = function(values)
+    at = (values**power - 1) / (2 * power) if power else np.log(values) / 2
     gap, mean = values[:, 1] - values[:, 0], values.mean(axis=1)
     close = np.abs(gap) < 1e-6  # an error of 1e-10 at most
-    across = np.where(close, derivative(mean), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
-    along = derivative(values)
+    across = np.where(close, 0.5 * mean ** (power - 1), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
+    along = 0.5 * values ** (power - 1)
     # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
     turned = f @ vectors
     change = [turned[:, :, None, a] * vectors[:, None, :, b] for a in (0, 1) for b in (0, 1)]
@@ -228,16 +292,6 @@ def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.einsum("na,nab,nb->n", direction, covariance, direction), 0)))
-
-
-def _equivalent(e: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Compute the equivalent strain (n,) and its uncertainty: first order where large, else that of noise alone."""
-    square = np.einsum("na,ab,nb->n", e, _EQUIVALENT, e)
-    noise = np.einsum("ab,nab->n", _EQUIVALENT, covariance)
-    slope = e @ _EQUIVALENT
-    first = np.einsum("na,nab,nb->n", slope, covariance, slope) / np.where(square > 0, square, np.inf)
-    large = square / (square + noise)
-    return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)
 
 
 def shortest_gauge(mesh: Tri3Mesh) -> float:
@@ -283,7 +337,7 @@ def strain_of(
     elements : ndarray, shape (E, 3)
         Node indices.
     u, v, *std : ndarray, shape (N,)
-        As of `StrainGauges.gradient`.
+        As of `Displacement.in_plane`.
     gauge
         Length of the virtual strain gauge in px; None: the shortest, three elements.
     measure
@@ -309,7 +363,7 @@ def strain_of(
     [0.01, 0.0, 0.0]
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
-    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, *std, measure=measure)
+    return StrainGauges.at_nodes(covariance, gauge).strain(Displacement.in_plane(u, v, *std), measure)
 
 
 @state_new_names
@@ -357,7 +411,7 @@ class StrainGauges:
     >>> mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 80, 60), shape=(80, 100)), element_size=20)
     >>> gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh))
     >>> u, zero = 0.01 * mesh.nodes[:, 0], np.zeros(len(mesh.nodes))
-    >>> strain = gauges.strain(u, zero, zero + 0.01, zero + 0.01)
+    >>> strain = gauges.strain(Displacement.in_plane(u, zero, zero + 0.01, zero + 0.01))
     >>> strain.components.round(6)[0].tolist()
     [0.01005, 0.0, 0.0]
     """
@@ -383,7 +437,7 @@ class StrainGauges:
         np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _MARGIN / 2 * mesh.sizes[node])
         lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
-        self.starts, self.bias = pattern.indptr, covariance.bias
+        self.starts, self.bias, self.surface = pattern.indptr, covariance.bias, covariance.surface
         self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
         self.nodes = pattern.indices.astype(np.int64)
         distance = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
@@ -455,48 +509,88 @@ class StrainGauges:
         """
         gauges = copy(self)
         gauges.points, gauges.needed, gauges.bias = self.points[nodes], self.needed[:, nodes], self.bias[nodes]
+        gauges.surface = None if self.surface is None else self.surface[nodes]
         gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [matrix[:, nodes] for matrix in self.slopes]
         return gauges
 
-    def gradient(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def gradient(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
         """Fit the planes to the displacements of one frame.
 
         Parameters
         ----------
-        u, v : ndarray, shape (N,)
-            In px; NaN where a node has no data.
-        *std : ndarray, shape (N,)
-            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
+        displacement
+            Of all nodes, shape (c, N); NaN where a node has no data.
 
         Returns
         -------
         gradient : ndarray, shape (G, 2, 2)
-            ``H[c, d]``: derivative of the displacement c by the coordinate d.
+            ``H[c, d]``: derivative of the displacement c by the coordinate d; of a displacement in space that in the
+            tangent plane of the surface, see `in_tangent_plane`.
         covariance : ndarray, shape (G, 4, 4)
             Of the gradient row by row.
         """
-        measured = np.isfinite(u + v + sum(std))
-        weights = self.full_weights if measured.all() else self.weights(measured)
-        values, spread = np.zeros((len(self.centres), 2, 2)), np.zeros((len(self.centres), 4, 4))
-        matrices = self.slopes if measured.all() else self._matrices(weights)
-        for component, value in enumerate((u, v)):
-            total_std, shared = (np.where(measured, array, 0.0) for array in (*std[component::2], np.zeros_like(u))[:2])
-            displacement, square = np.where(measured, value, 0.0), np.maximum(total_std**2 - shared**2, 0)
-            values[:, component] = np.stack([slope @ displacement for slope in matrices], axis=1)
-            products, block = weights[[0, 1, 0]] * weights[[0, 1, 1]], slice(2 * component, 2 * component + 2)
-            sums = np.stack([self._sum(array * square[self.nodes]) for array in products], axis=1) * self.inflation
-            if shared.any():
-                x, y = (slope @ (sp.diags(shared) @ self.bias) for slope in matrices)
-                sums += np.stack([_products(x, x), _products(y, y), _products(x, y)], axis=1)
-            spread[:, block, block] = sums[:, [[0, 2], [2, 1]]]
-        return values, spread
+        slopes, covariance = self.slopes_of(displacement)
+        if self.surface is None:
+            return slopes, covariance
+        return in_tangent_plane(self.tangents(displacement.is_measured), slopes, covariance)
 
-    def strain(self, u: FloatArray, v: FloatArray, *std: FloatArray, measure: str = MEASURES[0]) -> Strain:
-        """Compute the strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`.
+    def tangents(self, measured: BoolArray) -> FloatArray:
+        """Fit the planes to the nodes in space, as to the displacements of those of them that have data.
 
         Parameters
         ----------
-        u, v, *std : ndarray, shape (N,)
+        measured : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (G, 3, 2)
+        """
+        assert self.surface is not None
+        matrices = self.slopes if measured.all() else self._matrices(self.weights(measured))
+        return np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in self.surface.T], axis=1)
+
+    def slopes_of(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
+        """Fit the planes to each component of the displacements of one frame.
+
+        Parameters
+        ----------
+        displacement
+            As of `gradient`.
+
+        Returns
+        -------
+        slopes : ndarray, shape (G, c, 2)
+            Derivative of the displacement c by the coordinate d of the mesh.
+        covariance : ndarray, shape (G, 2 c, 2 c)
+            Of the slopes row by row.
+        """
+        measured, stated = displacement.is_measured, displacement.covariance
+        weights = self.full_weights if measured.all() else self.weights(measured)
+        matrices = self.slopes if measured.all() else self._matrices(weights)
+        values, std = (np.where(measured, array, 0.0) for array in (displacement.values, displacement.uncertainty))
+        bias = np.zeros_like(std) if displacement.bias is None else np.where(measured, displacement.bias, 0.0)
+        gradient = np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in values], axis=1)
+        count, products = len(values), weights[[0, 1, 0]] * weights[[0, 1, 1]]
+        spread = np.zeros((len(self.centres), count, 2, count, 2))
+        for i, j in zip(*(np.arange(count)[:, None] >= np.arange(count)).nonzero(), strict=True):
+            if i != j and stated is None:
+                continue
+            square = std[i] ** 2 if stated is None else np.where(measured, stated[i, j], 0.0)
+            square = np.maximum(square - bias[i] ** 2, 0) if i == j else square
+            sums = np.stack([self._sum(array * square[self.nodes]) for array in products], axis=1) * self.inflation
+            if i == j and bias[i].any():
+                x, y = (slope @ (sp.diags(bias[i]) @ self.bias) for slope in matrices)
+                sums += np.stack([_products(x, x), _products(y, y), _products(x, y)], axis=1)
+            spread[:, i, :, j] = spread[:, j, :, i] = sums[:, [[0, 2], [2, 1]]]
+        return gradient, spread.reshape(-1, 2 * count, 2 * count)
+
+    def strain(self, displacement: Displacement, measure: str = MEASURES[0]) -> Strain:
+        """Compute the strain of every gauge from the displacements of one frame; errors as `strain_of`.
+
+        Parameters
+        ----------
+        displacement
             As of `gradient`.
         measure
             Strain measure, as of `strain_of`.
@@ -505,7 +599,7 @@ class StrainGauges:
         -------
         Strain
         """
-        return strain_of_gradient(*self.gradient(u, v, *std), measure)
+        return _strain(*self.gradient(displacement), measure)
 
     def _matrices(self, weights: FloatArray) -> list[sp.csr_matrix]:
         return [sp.csr_matrix((w, self.nodes, self.starts), shape=self.needed.shape) for w in weights]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.field import Field
 from rgbmidic.typing import FloatArray
 
 
@@ -112,19 +113,23 @@ class Units:
         """
         return f"{unit or '1'}/{self.time}" + ("²" if power == 2 else "")
 
-    def lengths(self, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert lengths in px (or px over time) and their standard uncertainty to mm where the scale is known.
+    def convert(self, field: Field) -> Field:
+        """Convert lengths in px, and their standard uncertainty, to mm where the scale is known.
 
         Parameters
         ----------
-        values, std : ndarray
-            Lengths in px and their standard uncertainty.
+        field
+            Of any unit.
 
         Returns
         -------
-        values, std : ndarray
-            In mm, or as they were where the scale is not known.
+        Field
+            In mm, or as it was where its unit is not px or the scale is not known.
         """
-        if self.mm_per_pixel is None:
-            return values, std
-        return self.mm_per_pixel * values, np.hypot(self.mm_per_pixel * std, self.mm_per_pixel_std * values)
+        if field.unit != "px" or self.mm_per_pixel is None:
+            return field
+        scale, values = self.mm_per_pixel, field.values
+        scaled = replace(field.with_arrays(lambda array: scale * array), unit="mm")
+        if scaled.std is None:
+            return scaled
+        return replace(scaled, std=np.hypot(scaled.std, self.mm_per_pixel_std * values))

@@ -253,7 +253,7 @@ def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]
             finite = np.flatnonzero(np.isfinite(read.values))
             if len(finite):  # single outliers do not count
                 at = finite[np.argsort(read.values[finite])[min(len(finite) * 99 // 100, len(finite) - 1)]]
-                peaks.append((float(read.values[at]), float(read.std[at])))
+                peaks.append((float(read.values[at]), float(read.uncertainty[at])))
         if peaks:
             unit = maps.field(name).unit
             label = f"peak_{name}_{unit}" if unit else f"peak_{name}"

@@ -17,7 +17,7 @@ import numpy as np
 
 from rgbmidic.correlation import Deformed, Solution, Status, TrackingState, discretisation_error, track
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
-from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges
+from rgbmidic.fields import Displacement, MeshPoints, NodalCovariance, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import prepared_frame
@@ -209,15 +209,17 @@ def _gauge_figures(
     covariance = NodalCovariance.from_mesh(mesh)
     for length in fit:
         gauge = StrainGauges.at_nodes(covariance, length)
-        strains = [
-            gauge.strain(*static.displacement.T, *static.displacement_std.T, measure=measure) for static in still
-        ]
-        loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
+        loaded, *strains = (
+            gauge.strain(Displacement.in_plane(*one.displacement.T, *one.displacement_std.T), measure)
+            for one in (solution, *still)
+        )
         floor = _floor([static.components for static in strains], len(plan.settings.frames.reference))[1]
         size = np.abs(loaded.components)
         finite = size[np.isfinite(size)]
         largest = float(np.quantile(finite, CONSTANTS.largest)) if finite.size else float("nan")
-        noise = floor if np.isfinite(floor) else rms(loaded.components_std)
+        noise = (
+            floor if np.isfinite(floor) else rms(np.stack([loaded[name].uncertainty for name in ("exx", "eyy", "exy")]))
+        )
         yield GaugeFigures(length=length, noise=noise, largest=largest)
 
 

@@ -16,7 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.quantities import QUANTITIES, SHARED, STRAIN
+from rgbmidic.results.quantities import QUANTITIES, SHARED, STRAIN_COLUMNS
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES, ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
@@ -43,7 +43,7 @@ class _LazyQuantity(BackendArray):
 
     def __init__(self, result: Result, names: tuple[str, ...], maps: Maps | None = None) -> None:
         self.result, self.names, self.maps = result, names, maps
-        entries = {**QUANTITIES, **{entry.name: entry for entry in STRAIN}}
+        entries = {**QUANTITIES, **{entry.name: entry for entry in STRAIN_COLUMNS}}
         self.blank = entries[names[0]].unmeasured(result.table.sizes)
         self.dtype = self.blank.dtype
         self.shape = (len(result), *self.blank.shape, *([len(names)] if len(names) > 1 else []))

@@ -22,9 +22,9 @@ import numpy as np
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.field import column
+from rgbmidic.fields.quantity import ResultQuantity
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
-from rgbmidic.results.quantity import ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
@@ -61,7 +61,7 @@ def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
     """
     sizes = {"node": len(physical.mesh.nodes), "element": len(physical.mesh.elements)}
     sizes["light"] = len(physical.result.lights)
-    frame_bytes = sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values())
+    frame_bytes = sum(entry.unmeasured(sizes).nbytes for entry in physical.columns.values())
     # more than enough: y up has a vector of three numbers, a shear and a direction in single precision; 200 bytes of
     # each frame, node, element and light in what all frames share; what HDF5 writes of the arrays themselves
     frame_bytes += 20 * sizes["node"]
@@ -72,10 +72,10 @@ def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
 
     with h5py.File(file, "w") as out:
         _write_shared(out, physical)
-        for entry in physical.quantities.values():
+        for entry in physical.columns.values():
             _declare(out, physical, entry)
         _declare_grid(out.create_group("VTKHDF"), physical)
-        arrays, nodes = {name: out[name] for name in physical.quantities}, sizes["node"]
+        arrays, nodes = {name: out[name] for name in physical.columns}, sizes["node"]
         upward_arrays = {name: out[f"VTKHDF/PointData/{name}"] for name in ("displacement", *_SIGN_CHANGING)}
         for index in range(len(physical.result)):
             values, rows = physical.frame(index), slice(index * nodes, (index + 1) * nodes)
@@ -173,7 +173,7 @@ def _declare_grid(group: h5py.Group, physical: ResultInUnits) -> None:
     for name, shape in {"Part": (-1,), "Point": (-1,), "Cell": (-1, 1), "ConnectivityId": (-1, 1)}.items():
         steps[f"{name}Offsets"] = zeros.reshape(shape)
     data.create_dataset("displacement", (frames * nodes, 3), "<f4")
-    for entry in physical.quantities.values():
+    for entry in physical.columns.values():
         if entry.axes[:1] == ("node",) and entry.name not in ("u", "v"):
             _declare_nodal(data, group.file[entry.name], flip_sign=entry.name in _SIGN_CHANGING)
     for name in data:
@@ -268,7 +268,7 @@ def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
 
 def _write_csv(physical: ResultInUnits, file: BinaryIO) -> None:
     result, coordinates, has_times = physical.result, physical.coordinates, physical.units.timed
-    fields = {name: entry.unit for name, entry in physical.quantities.items() if entry.axes == ("node",)}
+    fields = {name: entry.unit for name, entry in physical.columns.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
     label = [] if result.node_number is None else [result.node_number.tolist()]
     head = ["frame", "number", "name", *(["time_s"] if has_times else []), "status", "node"]

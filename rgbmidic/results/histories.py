@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
-from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
+from rgbmidic.field import Displacement, Field, FieldSource
+from rgbmidic.fields.history import Probe, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
 from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
@@ -26,13 +27,6 @@ from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.result import Result
-from rgbmidic.results.result_in_units import (
-    ResultInUnits,
-    common_variance_fraction,
-    displacements,
-    frame_times,
-    reference_frames,
-)
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import format_value
 from rgbmidic.typing import AnyArray, FloatArray, IntArray
@@ -73,12 +67,12 @@ class Histories:
     status: IntArray
     times: FloatArray | None
     units: Units
-    quantities: tuple[History, ...] = ()
+    quantities: tuple[Field, ...] = ()
     stress_strain: tuple[str, str] | None = None
     remarks: tuple[str, ...] = ()
     channels: Channels | None = None
 
-    def __getitem__(self, name: str) -> History:
+    def __getitem__(self, name: str) -> Field:
         """Return the quantity of a name, or of a column name with unit."""
         for quantity in self.quantities:
             if name in (quantity.name, quantity.column):
@@ -111,7 +105,7 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
     for quantity in histories.quantities:
         finite_rows = np.flatnonzero(np.isfinite(quantity.values))
         finite_values = quantity.values[finite_rows]
-        std = np.full(len(finite_values), np.nan) if quantity.std is None else quantity.std[finite_rows]
+        std = quantity.uncertainty[finite_rows]
         extreme_indices = (
             (finite_values.argmin(), finite_values.argmax(), len(finite_values) - 1) if finite_values.size else ()
         )
@@ -171,7 +165,7 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
 
 @checked
 def read_histories(
-    result: Result,
+    result: Result | FieldSource,
     probes: ProbeSettings,
     *,
     scale: ScaleSettings | None = None,
@@ -184,7 +178,7 @@ def read_histories(
     Parameters
     ----------
     result
-        The result.
+        The result, or another source of fields.
     probes
         Where, and what.
     scale
@@ -212,35 +206,35 @@ def read_histories(
     """
     if not probes.kind_coordinates and probes.rigid_motion == "none":
         raise InputError("no probe is stated, such as a point (`points`, or [probes] of TEST.toml)")
-    physical = ResultInUnits.without_times(result, scale)
-    base = empty_histories(result, physical)
-    rectified, frames, units = replace(physical.rectified, units=base.units), base.frames, base.units
+    source: FieldSource = result.in_units(scale) if isinstance(result, Result) else result
+    base, rectified = empty_histories(source), source.rectified
+    frames, units = base.frames, base.units
+    if rectified is not None:
+        rectified = replace(rectified, units=units)
     if not len(frames):
-        raise InputError(f"no frame of {result.path} is measured yet")
+        raise InputError(f"no frame of {source.path} is measured yet")
     window = probes.window and rate_frames(probes.window, len(frames))
     counts, probe_list = Counter[str](), list[Probe]()
     for kind, position in probes.kind_coordinates:
         counts[kind] += 1
-        probe_list.append(make_probe(physical.covariance, kind, counts[kind], position, probes, rectified))
+        probe_list.append(make_probe(source.covariance, kind, counts[kind], position, probes, rectified))
     clock = base.numbers.astype(np.float64) if base.times is None else base.times
-    nodal, rigid, speed = _read_probes(physical, frames, probe_list, probes.rigid_motion, clock)
-    by_probe = {probe.name: probe.histories(series) for probe, series in zip(probe_list, nodal, strict=True)}
+    series, rigid, speed = _read_probes(source, frames, probe_list, probes.rigid_motion, clock)
+    by_probe = {probe.name: probe.histories(nodal) for probe, nodal in zip(probe_list, series, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
             raise InputError(
-                f"{name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
+                f"{name} is measured in no frame of {source.path}: the nodes around it are not measured (node_status "
                 "says why); place it elsewhere"
             )
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    common_fraction, references = common_variance_fraction(result), reference_frames(result)[frames]
-    compute_rates = (
-        partial(rates, clock, window=span, common_fraction=common_fraction, references=references) if window else None
-    )
-    all_histories = [*rigid, *(history for series in by_probe.values() for history in series)]
+    options: dict[str, Any] = {"common_fraction": source.common_fraction, "references": source.references[frames]}
+    compute_rates = partial(rates, clock, window=span, **options) if window else None
+    all_histories = [*rigid, *(history for histories in by_probe.values() for history in histories)]
     quantities = tuple(
         quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
     )
-    remarks = [*_remarks(physical, base, speed, by_probe)]
+    remarks = [*source.remarks, *_remarks(source, base, speed, by_probe)]
     if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
     if window:
@@ -249,70 +243,64 @@ def read_histories(
     return with_channels(probe_histories, channels or ChannelSettings())
 
 
-def empty_histories(result: Result, physical: ResultInUnits | None = None) -> Histories:
+def empty_histories(source: FieldSource) -> Histories:
     """Return histories of no probe: the measured frames and their times, for channels."""
-    physical = physical or ResultInUnits.without_times(result)
-    frames, times = np.flatnonzero(result.finished), frame_times(result, physical.scale)
+    frames, seconds = np.flatnonzero(source.finished), source.seconds
     return Histories(
         frames=frames,
-        numbers=result.number[frames],
-        status=result.status[frames],
-        times=None if times is None else times[frames],
-        units=replace(physical.units, timed=times is not None),
+        numbers=source.number[frames],
+        status=source.status[frames],
+        times=None if seconds is None else seconds[frames],
+        units=replace(source.units, timed=seconds is not None),
     )
 
 
 def _read_probes(
-    physical: ResultInUnits, frames: IntArray, probes: list[Probe], rigid_motion: str, clock: FloatArray
-) -> tuple[list[Nodal], list[History], FloatArray]:
+    source: FieldSource, frames: IntArray, probes: list[Probe], rigid_motion: str, clock: FloatArray
+) -> tuple[list[Displacement], list[Field], FloatArray]:
     """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
-    probe_fields: list[list[FloatArray]] = [[] for _ in probes]
-    motions = np.full((len(clock), 3, 2), np.nan)
-    speed, previous = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
-    for row, field in enumerate(displacements(physical.result, physical.rectified, frames.tolist())):
-        step = np.hypot(*(field[:2] - previous))
+    of_probes: list[list[Displacement]] = [[] for _ in probes]
+    motions = dict[int, RigidMotion]()
+    speed, previous = np.full(len(clock), np.nan), np.full(1, np.nan)
+    for row, frame in enumerate(frames.tolist()):
+        displacement = source.displacement(frame)
+        step = np.linalg.norm(displacement.values - previous, axis=0)
         if row and np.isfinite(step).any():
             # of the fast nodes: single outliers do not count
             speed[row] = np.nanpercentile(step, 95) / (clock[row] - clock[row - 1])
-        previous = field[:2]
-        if rigid_motion != "none" and np.isfinite(field).all(axis=0).sum() > 1:
-            motion = RigidMotion.of(physical.covariance, *field)
-            motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
-            field = motion.removed(physical.mesh.nodes, field) if rigid_motion == "remove" else field
-        for fields, probe in zip(probe_fields, probes, strict=True):
-            fields.append(field[:, probe.nodes])
-    nodal = [Nodal.of(np.stack(fields, axis=1)) for fields in probe_fields]
-    motions[:, 2] = np.degrees(motions[:, 2])
-    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid_motion != "none" else {}
-    histories = [
-        History(name=name, unit=unit, values=motions[:, component, 0], std=motions[:, component, 1])
-        for component, (name, unit) in enumerate(names.items())
-    ]
-    return nodal, histories, speed
+        previous = displacement.values
+        if rigid_motion != "none" and displacement.is_measured.sum() > 1:
+            motions[row] = motion = RigidMotion.of(source.covariance, displacement)
+            displacement = motion.removed(source.points, displacement) if rigid_motion == "remove" else displacement
+        for fields, probe in zip(of_probes, probes, strict=True):
+            fields.append(displacement.isel(node=probe.nodes))
+    histories = []
+    for component in zip(*(motion.components for motion in motions.values()), strict=True):
+        values, std = np.full((2, len(clock)), np.nan)
+        values[[*motions]], std[[*motions]] = zip(*((one.values, one.uncertainty) for one in component), strict=True)
+        histories.append(replace(component[0], dims=("frame",), values=values, std=std))
+    return [Displacement.stack(fields) for fields in of_probes], histories, speed
 
 
-def convert_history(history: History, units: Units, compute_rates: Callable[..., Rates] | None) -> Iterator[History]:
+def convert_history(
+    history: Field, units: Units, compute_rates: Callable[[Field], dict[str, Field]] | None
+) -> Iterator[Field]:
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
-    is_length = history.unit == "px"
-    unit = units.length if is_length else history.unit
-
-    def entry(name: str, unit: str, values: FloatArray, std: FloatArray) -> History:
-        values, std = units.lengths(values, std) if is_length else (values, std)
-        return History(name=name, unit=unit, values=values, std=std)
-
-    if history.std is None:
-        yield history
+    converted, is_length = units.convert(history), history.unit in ("px", "mm")
+    yield converted
+    if (
+        history.std is None
+        or compute_rates is None
+        or (history.unit == "deg" and not history.name.startswith("rigid_rotation"))
+    ):
         return
-    yield entry(history.name, unit, history.values, history.std)
-    if compute_rates is None or (history.unit == "deg" and history.name != "rigid_rotation"):
-        return
-    rate_values = compute_rates(history.values, history.std)
+    rate_fields = compute_rates(history)
     for power, name in enumerate(("velocity", "acceleration") if is_length else ("velocity",), start=1):
         for suffix in ("", "_before", "_after"):
-            values, std = getattr(rate_values, f"{name}{suffix}"), getattr(rate_values, f"{name}{suffix}_std")
-            if not suffix or np.isfinite(values).any():  # else no kink
+            rate = units.convert(rate_fields[f"{name}{suffix}"])
+            if not suffix or np.isfinite(rate.values).any():  # else no kink
                 title = f"{history.name}_{name if is_length else 'rate'}{suffix}"
-                yield entry(title, units.per_time(unit, power), values, std)
+                yield replace(rate, name=title, unit=units.per_time(converted.unit, power), note="")
 
 
 def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
@@ -376,9 +364,7 @@ def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
         raise InputError(
             f"channels of {settings.file} have the names of columns of the history, rename: {', '.join(clashing_names)}"
         )
-    channel_histories = [
-        History(name=name, unit="", values=values, std=None) for name, values in channel_values.items()
-    ]
+    channel_histories = [Field(name=name, values=values) for name, values in channel_values.items()]
     for name, values in channel_values.items():
         if missing := int(np.isnan(values).sum()):
             remarks.append(f"the channel {name} has no value in {missing} of {len(histories.frames)} frames")
@@ -386,7 +372,7 @@ def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
     if settings.area is not None:
         name, newtons = channels.force(settings.force)
         channel_histories.append(
-            History(name="stress", unit="MPa", values=channel_values[name] * newtons / settings.area, std=None)
+            Field(name="stress", unit="MPa", values=channel_values[name] * newtons / settings.area)
         )
         strain = next(
             (quantity.name for quantity in histories.quantities if quantity.name.endswith(("_strain", "_e1"))), None
@@ -402,13 +388,9 @@ def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
 
 
 def _remarks(
-    physical: ResultInUnits, base: Histories, speed: FloatArray, by_probe: Mapping[str, list[History]]
+    source: FieldSource, base: Histories, speed: FloatArray, by_probe: Mapping[str, list[Field]]
 ) -> Iterator[str]:
-    units, frames, exposure = base.units, base.frames, (physical.result.provenance.get("exposure_ns") or 0) * 1e-9
-    if (camera := physical.rectified.camera) is not None:
-        yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
-    if units.mm_per_pixel is None:
-        yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
+    units, frames, exposure = base.units, base.frames, source.exposure
     if not units.timed:
         yield "no time is known: the frame is the unit of time (frame_rate in [scale])"
     blurred = np.nan_to_num(speed) * exposure > 1  # px: the speckle is smeared over a pixel

@@ -6,7 +6,7 @@ accelerations and strain rates are those of `rgbmidic.fields.rates` at every nod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Self
@@ -15,29 +15,20 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
+from rgbmidic.fields.quantity import ResultQuantity
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, map_quantities
-from rgbmidic.results.quantity import ResultQuantity
+from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, map_quantities
 from rgbmidic.results.result import Portable, Result
-from rgbmidic.results.result_in_units import (
-    DISPLACEMENT_QUANTITIES,
-    EDGE_QUANTITIES,
-    ResultInUnits,
-    common_variance_fraction,
-    displacements,
-    edge_std,
-    frame_times,
-    reference_frames,
-    strain_by_name,
-)
-from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
-from rgbmidic.typing import BoolArray, FloatArray, IntArray
+from rgbmidic.results.result_in_units import ResultInUnits, frame_times
+from rgbmidic.settings import ProbeSettings, ScaleSettings
+from rgbmidic.typing import FloatArray, IntArray
 
 DEFAULT_RATE_WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
@@ -49,38 +40,6 @@ _PICTURE_TRIANGLES = 80_000
 is then a sixteenth."""
 _NODES_PER_BATCH = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
-
-
-@state_new_names
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapValues:
-    """A field in one frame.
-
-    Attributes
-    ----------
-    values, std : ndarray, shape (N,)
-        In the unit of the field; NaN where not known.
-    deformed_nodes : ndarray, shape (N, 2)
-        Deformed places of the nodes, px of the image; NaN where not measured.
-    status : ndarray, shape (N,), uint8
-        `node_status`.
-
-    Examples
-    --------
-    >>> exx = Maps.from_result(Result.open("my_result")).read("exx", 1)
-    >>> exx.values.shape == exx.std.shape == exx.status.shape
-    True
-    """
-
-    values: FloatArray
-    std: FloatArray
-    deformed_nodes: FloatArray
-    status: npt.NDArray[np.uint8]
-
-    @property
-    def is_doubtful(self) -> BoolArray:
-        """Mask of the nodes whose value lies within two standard uncertainties of 0, shape (N,)."""
-        return np.asarray(np.abs(self.values) < 2 * self.std)
 
 
 @state_new_names
@@ -142,7 +101,7 @@ class Maps(Portable):
         InputError
             As of `with_options`.
         """
-        return cls(result=result, physical=ResultInUnits.without_times(result, scale)).with_options(**choices)
+        return cls(result=result, physical=result.in_units(scale)).with_options(**choices)
 
     def with_options(
         self,
@@ -196,8 +155,7 @@ class Maps(Portable):
     @cached_property
     def quantities(self) -> dict[str, ResultQuantity]:
         """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
-        error = self.result.section(MeshSettings).error
-        return map_quantities(self._units, self.result.lights, with_error=bool(error))
+        return map_quantities(self.physical.components, self.physical.quantities.values(), self._units)
 
     def field(self, name: str) -> ResultQuantity:
         """Return a field by its name.
@@ -245,7 +203,7 @@ class Maps(Portable):
             phrases = [strain, rate_words(self.window, len(self._measured_frames))]
         return ", ".join(filter(None, phrases))
 
-    def read(self, name: str, frame: int) -> MapValues:
+    def read(self, name: str, frame: int) -> Field:
         """Read a field in one frame.
 
         Parameters
@@ -257,8 +215,8 @@ class Maps(Portable):
 
         Returns
         -------
-        MapValues
-            Its values, uncertainties and the places of the nodes.
+        Field
+            At the nodes, shape (N,), with its standard uncertainty, NaN where it has none.
 
         Raises
         ------
@@ -267,91 +225,26 @@ class Maps(Portable):
         ResultError
             The frame is damaged, or does not fit the mesh.
         """
-        kind = self.field(name).kind
+        entry, base = self.field(name), name.removesuffix("_std")
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
-        base = name.removesuffix("_std")
-        derived = base in DERIVED or name in ERROR_QUANTITIES
-        stored: tuple[str, ...] = (
-            ()
-            if derived or name in DISPLACEMENT_QUANTITIES
-            else EDGE_QUANTITIES
-            if name in EDGE_QUANTITIES
-            else (name,)
-        )
-        if kind == "fraction":
-            stored = ("light_fraction",)
-        record = next(self.result.table.iterate(["u", "v", "node_status", *stored], [frame]))
-        nothing = np.full(len(self.result.nodes), np.nan)
-        if name in ERROR_QUANTITIES:
-            values, std = self._with_error(ERROR_QUANTITIES[name], frame), nothing
-        elif derived:
-            values, std = self._derived(base, frame)
-            values, std = (std, nothing) if base != name else (values, std)
-        elif kind == "fraction":
-            light = self.result.lights.index(name.removeprefix("fraction of "))
-            values, std = np.where(record["node_status"] == 0, record["light_fraction"][:, light], np.nan), nothing
-        elif name in DISPLACEMENT_QUANTITIES:
-            values, std = (
-                self.physical.length * next(self._displacements([frame]))[DISPLACEMENT_QUANTITIES.index(name)],
-                nothing,
-            )
-        elif name in EDGE_QUANTITIES:
-            edge = edge_std(self.physical.rectified, record)[EDGE_QUANTITIES.index(name)]
-            values, std = self.physical.length * edge, nothing
+        if base != name and base in self.quantities:
+            field = Field(name=name, unit=entry.unit, dims=("node",), values=self.read(base, frame).uncertainty)
+        elif entry.group == "Strain":
+            field = self._strain(frame)[name]
+        elif entry.order or name == "magnitude" or name in self.physical.components:
+            field = self._derived(entry, frame)
         else:
-            values, std = np.asarray(record[name], dtype=np.float64), nothing
-        return MapValues(
-            values=np.ascontiguousarray(values, dtype=np.float64),
-            std=np.asarray(std, dtype=np.float64),
-            deformed_nodes=self.result.nodes + np.stack([record["u"], record["v"]], axis=1),
-            status=record["node_status"],
-        )
+            field = self._current.field(name, frame)
+        return replace(field, std=field.uncertainty)
 
-    def _with_error(self, entry: ResultQuantity, frame: int) -> FloatArray:
-        """Compute a field of `ERROR_QUANTITIES` (N,) against the test's reference; NaN in frames without."""
-        names = {
-            f"{component}{suffix}": None
-            for component in (*UV, *entry.base_quantities)
-            for suffix in ("", "_std", "_mesh_error")
-        }
-        record = next(self.result.table.iterate([*names], [frame]))
-        if not record["u_mesh_error"].size:
-            return np.full(len(self.result.nodes), np.nan)
-        double = {key: np.asarray(values, dtype=np.float64) for key, values in record.items()}
-        std_and_error = [
-            (double[f"{component}_std"], double[f"{component}_mesh_error"]) for component in entry.base_quantities
-        ]
-        if len(std_and_error) > 1:
-            return np.asarray(np.fmax.reduce([error / std for std, error in std_and_error]))
-        std, error = std_and_error[0]
-        if (component := entry.base_quantities[0]) in UV:
-            suffixes = ("_std", "_mesh_error")
-            inputs = ([double[f"{name}{term}"] for term in ("", suffix) for name in UV] for suffix in suffixes)
-            rectified = (self.physical.rectified.displacement(*arrays)[2 + UV.index(component)] for arrays in inputs)
-            std, error = (self.physical.length * term for term in rectified)
-        return error if entry.name.endswith("_error") else np.hypot(error, std)
+    @property
+    def _current(self) -> ResultInUnits:
+        """The result in units with all its frames; `physical` may be of an earlier state."""
+        return self.physical if self.physical.result is self.result else replace(self.physical, result=self.result)
 
-    def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Compute a length, a strain or a rate, and its uncertainty, each (N,)."""
-        entry = DERIVED[name]
-        if entry.group == "Strain":
-            return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
-        if entry.order:
-            components = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
-        else:
-            displacement = self.displacement(frame)
-            components = [displacement[UV.index(component) : 4 : 2] for component in entry.base_quantities]
-        values, std = components[0]
-        if len(components) > 1:
-            vector, error = (np.stack(terms, axis=1) for terms in zip(*components, strict=True))
-            values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(components)))
-        return self._units.lengths(values, std) if entry.unit else (values, std)
-
-    def displacement(self, frame: int) -> FloatArray:
-        """Return u, v, their standard uncertainties and what the lights' bias leaves of these, (6, N) in rectified px.
-
-        They are those since `since`, the rigid motion removed.
+    def deformed_nodes(self, frame: int) -> FloatArray:
+        """Compute the deformed places of the nodes, px of the image; NaN where not measured.
 
         Parameters
         ----------
@@ -360,11 +253,46 @@ class Maps(Portable):
 
         Returns
         -------
-        ndarray, shape (6, N)
+        ndarray, shape (N, 2)
+        """
+        record = next(self.result.table.iterate(UV, [frame]))
+        return np.asarray(self.result.nodes + np.stack([record[name] for name in UV], axis=1))
+
+    def _derived(self, entry: ResultQuantity, frame: int) -> Field:
+        """Compute a displacement or a rate in the reader's units."""
+        if entry.order:
+            components = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
+        else:
+            by_name = {component.name: component for component in self.displacement(frame).components}
+            components = [by_name[name] for name in entry.base_quantities]
+        field = components[0]
+        if len(components) > 1:
+            vector, error = (
+                np.stack(terms, axis=1) for terms in zip(*((c.values, c.uncertainty) for c in components), strict=True)
+            )
+            covariance = error[:, :, None] ** 2 * np.eye(len(components))
+            if not entry.order and (stated := self.displacement(frame).covariance) is not None:
+                covariance = np.moveaxis(stated, 2, 0)
+            length, std = length_of(vector, covariance)
+            field = replace(field, values=length, std=std, bias=None)
+        return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
+
+    def displacement(self, frame: int) -> Displacement:
+        """Return the displacement of the nodes in the unit of the source, since `since`, the rigid motion removed.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Displacement
+            Of the shape (c, N).
         """
         displacement = self._relative_displacement(frame)
         motion = self._rigid(displacement)
-        return displacement if motion is None else motion.removed(self._covariance.mesh.nodes, displacement)
+        return displacement if motion is None else motion.removed(self._covariance.points, displacement)
 
     def triangulate(self, field: ResultQuantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
         """Return nodal values as pictures draw them, linear in triangles, and the triangles.
@@ -410,8 +338,8 @@ class Maps(Portable):
         """
         return MeshPoints.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
 
-    def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
-        """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.
+    def strain_at(self, frame: int, x: float, y: float, length: float) -> Strain:
+        """Compute the strain of one virtual gauge at a place of the image, px.
 
         Parameters
         ----------
@@ -424,16 +352,15 @@ class Maps(Portable):
 
         Returns
         -------
-        dict of str to ndarray, shape (1,)
+        Strain
+            Of the shape (1,).
 
         Raises
         ------
         InputError
             The place is outside the mesh, or the gauge is too short.
         """
-        return strain_by_name(
-            self._strain_of(frame, self._gauge(*self.physical.rectified.probe_coordinates((x, y, length), 1)))
-        )
+        return self._strain_of(frame, self._gauge(*self.physical.rectified.probe_coordinates((x, y, length), 1)))
 
     @cached_property
     def _gauge(self) -> Callable[[float, float, float], StrainGauges]:
@@ -442,81 +369,74 @@ class Maps(Portable):
             lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
         )
 
-    def _displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
-        return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
-
-    def _relative_displacement(self, frame: int) -> FloatArray:
-        """Return u, v and their uncertainties (6, N) since the frame that is the reference here."""
-        displacement = next(self._displacements([frame]))
+    def _relative_displacement(self, frame: int) -> Displacement:
+        """Return the displacement since the frame that is the reference here."""
+        displacement = self._current.displacement(frame)
         if self.since is None:
             return displacement
-        base, factor = self._base_displacement, self._shared_fraction(frame)
-        variance = displacement[2:] ** 2 + base[2:] ** 2 - 2 * factor * np.minimum(displacement[2:], base[2:]) ** 2
-        return np.concatenate([displacement[:2] - base[:2], np.sqrt(np.maximum(variance, 0))])
+        return displacement.since(self._base_displacement, self._shared_fraction(frame))
 
     @cached_property
-    def _base_displacement(self) -> FloatArray:
-        return next(self._displacements([self.since or 0]))
+    def _base_displacement(self) -> Displacement:
+        return self._current.displacement(self.since or 0)
 
     def _shared_fraction(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
         if frame == self.since:
             return 1.0
-        references = reference_frames(self.result)[[frame, self.since or 0]]
-        return float(frame_covariance(np.ones(2), common_variance_fraction(self.result), references)[0, 1])
+        references = self._current.references[[frame, self.since or 0]]
+        return float(frame_covariance(np.ones(2), self._current.common_fraction, references)[0, 1])
 
     @cached_property
     def _covariance(self) -> NodalCovariance:
         """Correlation of the nodes' errors, with the nodes where they are at the reference."""
         if self.since is None:
             return self.physical.covariance
-        mesh = self.physical.mesh
-        deformed = mesh.nodes + np.nan_to_num(self._base_displacement[:2].T)
-        return replace(self.physical.covariance, mesh=Tri3Mesh(nodes=deformed, elements=mesh.elements))
+        deformed = self.physical.points + np.nan_to_num(self._base_displacement.values.T)
+        if deformed.shape[1] > 2:
+            return replace(self.physical.covariance, surface=deformed)
+        mesh = Tri3Mesh(nodes=deformed, elements=self.physical.mesh.elements)
+        return replace(self.physical.covariance, mesh=mesh)
 
-    def _rigid(self, displacement: FloatArray) -> RigidMotion | None:
+    def _rigid(self, displacement: Displacement) -> RigidMotion | None:
         """Fit the rigid motion that is removed; None where none is, or fewer than two nodes are measured."""
-        fits = self.rigid_removed and np.isfinite(displacement).all(axis=0).sum() > 1
-        return RigidMotion.of(self._covariance, *displacement) if fits else None
+        fits = self.rigid_removed and displacement.is_measured.sum() > 1
+        return RigidMotion.of(self._covariance, displacement) if fits else None
 
     @cached_property
-    def _strain(self) -> Callable[[int], Mapping[str, FloatArray]]:
-        """Strain by name of a frame; of the last two it is kept, for several fields of one frame."""
-        return lru_cache(2)(lambda frame: strain_by_name(self._strain_of(frame, self.physical.gauges)))
+    def _strain(self) -> Callable[[int], Strain]:
+        """Strain of a frame; of the last two it is kept, for several fields of one frame."""
+        return lru_cache(2)(lambda frame: self._strain_of(frame, self.physical.gauges))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        displacement = next(self._displacements([frame]))
+        displacement = self._current.displacement(frame)
         if self.since is None:
-            gradient, covariance = gauges.gradient(*displacement)
+            gradient, covariance = gauges.gradient(displacement)
         else:  # both gradients of the same nodes, which have data in both frames
-            in_both_frames, factor = (
-                np.isfinite(displacement + self._base_displacement).all(axis=0),
-                self._shared_fraction(frame),
-            )
+            in_both_frames = displacement.is_measured & self._base_displacement.is_measured
             present, base = (
-                np.where(in_both_frames, displacement, np.nan),
-                np.where(in_both_frames, self._base_displacement, np.nan),
+                one.with_arrays(lambda array: np.where(in_both_frames, array, np.nan))
+                for one in (displacement, self._base_displacement)
             )
-            smaller = np.sqrt(abs(factor)) * np.minimum(present[2:], base[2:])
-            shared_covariance = np.sign(factor) * gauges.gradient(*present[:2], *smaller)[1]
+            factor = self._shared_fraction(frame)
+            shared_covariance = factor * gauges.gradient(present.smaller(base))[1]
             gradient, covariance = _relative_gradient(
-                gauges.gradient(*present), gauges.gradient(*base), shared_covariance
+                gauges.gradient(present), gauges.gradient(base), shared_covariance
             )
         motion = self._rigid(self._relative_displacement(frame))
-        if motion is not None:
-            c, s = np.cos(motion.rotation), np.sin(motion.rotation)
-            back = np.array([[c, s], [-s, c]])
-            wide = np.kron(back, np.eye(2))
-            gradient, covariance = back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
+        if motion is not None and len(motion.back) == 2:  # in the tangent plane nothing turns
+            wide = np.kron(motion.back, np.eye(2))
+            gradient, covariance = motion.back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
         return strain_of_gradient(gradient, covariance, self.physical.measure)
 
-    def _rates(self, name: str, frame: int, order: int) -> FloatArray:
-        """Return the derivative of an order of a field against the test's reference, and its uncertainty, (2, N)."""
+    def _rates(self, name: str, frame: int, order: int) -> Field:
+        """Return the derivative of an order of a field against the test's reference, shape (N,)."""
         positions = np.flatnonzero(self._measured_frames == frame)
         if not len(positions):  # not measured yet
-            return np.full((2, len(self.result.nodes)), np.nan)
+            nothing, unit = np.full(len(self.result.nodes), np.nan), self.field(name).unit
+            return Field(name=name, unit=unit, dims=("node",), values=nothing, std=nothing)
         block, row = divmod(int(positions[0]), _WINDOWS_PER_BLOCK * self.window)
-        return self._block(name, block)[order - 1, :, row]
+        return self._block(name, block)[order - 1].isel(frame=row)
 
     @cached_property
     def _measured_frames(self) -> IntArray:
@@ -540,36 +460,38 @@ class Maps(Portable):
         return np.asarray(clock[self._measured_frames], dtype=np.float64)
 
     @cached_property
-    def _block(self) -> Callable[[str, int], FloatArray]:
-        """Rates (2 orders, value and uncertainty, frames, N) of a block of frames; those used last are kept."""
+    def _block(self) -> Callable[[str, int], list[Field]]:
+        """Velocity and acceleration (frames, N) in a block of frames; those used last are kept."""
         return lru_cache(4)(self._rates_of)
 
-    def _rates_of(self, name: str, block: int) -> FloatArray:
+    def _rates_of(self, name: str, block: int) -> list[Field]:
         """Compute rates of a field from the frames of a block and those around: the same whichever is asked for."""
         window_frames = rate_frames(self.window, len(self._measured_frames))
         size = _WINDOWS_PER_BLOCK * self.window
         block_slice = slice(block * size, min((block + 1) * size, len(self._measured_frames)))
         padded_slice = slice(max(block_slice.start - size, 0), block_slice.stop + size)
         frames, clock = self._measured_frames[padded_slice], self._clock[padded_slice]
-        absolute_maps = replace(self, since=None, rigid_removed=False)
-        if name in UV:
-            fields = (displacement[UV.index(name) : 4 : 2] for displacement in self._displacements(frames.tolist()))
+        maps = replace(self, since=None, rigid_removed=False)
+        if name in self.physical.components:  # as they are, in px: the scale has no noise
+            index = self.physical.components.index(name)
+            fields = [self._current.displacement(frame).components[index] for frame in frames.tolist()]
         else:
-            fields = (np.stack(absolute_maps._derived(name, frame)) for frame in frames.tolist())
-        series = np.stack([*fields], axis=1)
-        span = (window_frames - 1) * float(np.median(np.diff(self._clock)))
-        common_fraction, references = common_variance_fraction(self.result), reference_frames(self.result)[frames]
-        rows = slice(block_slice.start - padded_slice.start, block_slice.stop - padded_slice.start)
-        block_rates = np.empty((2, 2, block_slice.stop - block_slice.start, series.shape[2]))
-        for first_node in range(0, series.shape[2], _NODES_PER_BATCH):
-            nodes = slice(first_node, first_node + _NODES_PER_BATCH)
-            node_rates = rates(
-                clock, *series[..., nodes], window=span, common_fraction=common_fraction, references=references
-            )
-            for order, quantity in enumerate(("velocity", "acceleration")):
-                block_rates[order, 0, :, nodes] = getattr(node_rates, quantity)[rows]
-                block_rates[order, 1, :, nodes] = getattr(node_rates, f"{quantity}_std")[rows]
-        return block_rates
+            fields = [maps.read(name, frame) for frame in frames.tolist()]
+        series, rows = (
+            Field.stack(fields),
+            slice(block_slice.start - padded_slice.start, block_slice.stop - padded_slice.start),
+        )
+        options: dict[str, Any] = {
+            "window": (window_frames - 1) * float(np.median(np.diff(self._clock))),
+            "common_fraction": self._current.common_fraction,
+            "references": self._current.references[frames],
+        }
+        starts = range(0, len(self.result.nodes), _NODES_PER_BATCH)
+        parts = [rates(clock, series.isel(node=slice(start, start + _NODES_PER_BATCH)), **options) for start in starts]
+        return [
+            Field.join([part[quantity].isel(frame=rows) for part in parts], "node")
+            for quantity in ("velocity", "acceleration")
+        ]
 
 
 def _relative_gradient(

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.field import column
+from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.quantities import UV
-from rgbmidic.results.result_in_units import common_variance_fraction, frame_times
+from rgbmidic.results.result_in_units import frame_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -68,8 +67,9 @@ class Profile:
         In seconds.
     units
         Of lengths and time.
-    values, std : ndarray, shape (T, P)
-        At each point in each frame; NaN where not measured.
+    data
+        The field at each point in each frame, shape (T, P), with its standard uncertainty; NaN where not measured. Its
+        arrays are `values` and `std`.
     bias_fractions : ndarray, shape (T,)
         Part of the variance of u or v along the line that the lights' bias leaves.
     common_fraction
@@ -113,9 +113,15 @@ class Profile:
         times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
-        self.values, self.std = np.full((2, len(self.frames), len(self.line.points)), np.nan)
+        self.data = Field(
+            name=field,
+            unit=self.field.unit,
+            dims=("frame", "position"),
+            values=np.full((len(self.frames), len(self.line.points)), np.nan),
+            std=np.full((len(self.frames), len(self.line.points)), np.nan),
+        )
         self.bias_fractions = np.zeros(len(self.frames))
-        self.common_fraction, self.rate_window = common_variance_fraction(result), 0.0
+        self.common_fraction, self.rate_window = physical.common_fraction, 0.0
         if self.field.group == "Rates" and len(self.frames) > 1:
             self.rate_window = (maps.window - 1) * float(np.median(np.diff(self.clock)))
 
@@ -130,21 +136,37 @@ class Profile:
             Indices of the rows, one a frame.
         """
         for row in rows:
-            name, frame, bias = self.field.name, int(self.frames[row]), np.zeros(1)
-            map_values = maps.read(name, frame)
-            if name in UV:
-                bias = (self.units.mm_per_pixel or 1.0) * maps.displacement(frame)[4 + UV.index(name)]
-                variances = np.square([bias, map_values.std])[:, self.line.nodes]
+            nodal = maps.read(self.field.name, int(self.frames[row]))
+            if nodal.bias is not None:
+                variances = np.square([nodal.bias, nodal.uncertainty])[:, self.line.nodes]
                 bias_variance, total_variance = np.nansum(variances, axis=1)
                 self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
-            self.values[row], self.std[row] = self.line.read(
-                map_values.values, map_values.std, self.covariance_key, bias
-            )
+            along = self.line.read(nodal, self.covariance_key)
+            self.values[row], self.std[row] = along.values, along.uncertainty
+
+    @property
+    def values(self) -> FloatArray:
+        """Values (T, P) of `data`."""
+        return self.data.values
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard uncertainties (T, P) of `data`."""
+        return self.data.uncertainty
 
     @property
     def positions(self) -> FloatArray:
         """Distance (P,) of the points from the first end, in the unit of lengths."""
-        return self.line.positions * (self.units.mm_per_pixel or 1.0)
+        return self.line.positions * self._scale
+
+    @property
+    def places(self) -> FloatArray:
+        """Places (P, 2) of the points on the reference, or (P, 3) in space, in the unit of lengths."""
+        return self._scale * (self.line.points if self.line.surface is None else self.line.surface)
+
+    @property
+    def _scale(self) -> float:
+        return (self.units.mm_per_pixel or 1.0) if self.line.surface is None else 1.0
 
     @property
     def clock(self) -> FloatArray:
@@ -261,8 +283,8 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     for file in (out, *([arrivals_path] if wave else [])):
         check_file(file, overwrite=overwrite)
     unit, value = profile.units.length, column(profile.field.name, profile.field.unit)
-    head = [column(name, unit) for name in ("position", "x", "y")]
-    positions = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
+    head = [column(name, unit) for name in ("position", *"xyz"[: profile.places.shape[1]])]
+    positions = np.column_stack([profile.positions, profile.places])
     time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:

@@ -5,14 +5,15 @@ Each is declared once, here; records, store, exports, maps and documents read th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rgbmidic.fields.strain import EQUIVALENT
+from rgbmidic.fields.quantity import ESTIMATED, ResultQuantity, with_uncertainty
+from rgbmidic.fields.strain import STRAIN
 from rgbmidic.fields.units import Units
-from rgbmidic.results.quantity import ESTIMATED, ResultQuantity, with_uncertainty
 from rgbmidic.timing import STAGES
 
 NO_CHECKSUM = -1
@@ -61,10 +62,10 @@ _TABLE = (
         dtype=np.int64, blank=NO_CHECKSUM),
     ResultQuantity("node_status", _NODE, "", "node_status",
         "see below", dtype=np.uint8, blank=1, codes=_NODE_OUTCOMES, kind="codes"),
-    ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_DOUBLE),
-    ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_DOUBLE),
-    ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
-    ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    *with_uncertainty(
+        ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_DOUBLE),
+        ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_DOUBLE),
+    ),
     ResultQuantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
     ResultQuantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
     ResultQuantity("u_edge_std", _NODE, "px", "edge_std.0", _EDGE.format("u"), kind="positive"),
@@ -135,54 +136,45 @@ MESH_DOCUMENT = "finite_elements"
 """Name of its entry in the provenance, and of the source that wrote it."""
 
 UV = ("u", "v")
-DERIVED = {
-    name: ResultQuantity(
-        name, _NODE, unit, "", description, symbol=symbol, base_quantities=base, order=order,
-        group="Rates" if order else "Displacement",
-        kind="strain" if not unit else "positive" if base == UV else "displacement",
-    )
-    for name, unit, symbol, description, base, order in (
-        ("u", "px", "u", "displacement in x", ("u",), 0),
-        ("v", "px", "v", "displacement in y", ("v",), 0),
-        ("magnitude", "px", "|u|", "length of the displacement", UV, 0),
-        ("u_velocity", "px", "du/dt", "velocity in x", ("u",), 1),
-        ("v_velocity", "px", "dv/dt", "velocity in y", ("v",), 1),
-        ("velocity", "px", "|du/dt|", "magnitude of the velocity", UV, 1),
-        ("u_acceleration", "px", "d²u/dt²", "acceleration in x", ("u",), 2),
-        ("v_acceleration", "px", "d²v/dt²", "acceleration in y", ("v",), 2),
-        ("acceleration", "px", "|d²u/dt²|", "magnitude of the acceleration", UV, 2),
-        ("exx_rate", "", "dεxx/dt", "rate of the strain in x", ("exx",), 1),
-        ("eyy_rate", "", "dεyy/dt", "rate of the strain in y", ("eyy",), 1),
+
+
+def derived_quantities(components: tuple[str, ...]) -> dict[str, ResultQuantity]:
+    """Return what follows from a displacement with these components, and rates of strain, by name."""
+    axis = dict(zip(components, "xyz", strict=False))
+    table = [
+        *((name, "px", name, f"displacement in {axis[name]}", (name,), 0) for name in components),
+        ("magnitude", "px", "|u|", "length of the displacement", components, 0),
+        *((f"{name}_velocity", "px", f"d{name}/dt", f"velocity in {axis[name]}", (name,), 1) for name in components),
+        ("velocity", "px", "|du/dt|", "magnitude of the velocity", components, 1),
+        *(
+            (f"{name}_acceleration", "px", f"d²{name}/dt²", f"acceleration in {axis[name]}", (name,), 2)
+            for name in components
+        ),
+        ("acceleration", "px", "|d²u/dt²|", "magnitude of the acceleration", components, 2),
+        *((f"e{axes}_rate", "", f"dε{axes}/dt", f"rate of the strain in {axes[0]}", (f"e{axes}",), 1)
+          for axes in ("xx", "yy")),
         ("exy_rate", "", "dεxy/dt", "rate of the tensor shear", ("exy",), 1),
         ("equivalent_rate", "", "dεeq/dt", "rate of the von Mises equivalent strain", ("equivalent",), 1),
-    )
-}  # fmt: skip
+    ]  # fmt: skip
+    return {
+        name: ResultQuantity(
+            name, _NODE, unit, "", description, symbol=symbol, base_quantities=base, order=order,
+            group="Rates" if order else "Displacement",
+            kind="strain" if not unit else "positive" if len(base) > 1 else "displacement",
+        )
+        for name, unit, symbol, description, base, order in table
+    }  # fmt: skip
+
+
+DERIVED = derived_quantities(UV) | STRAIN
 """Displacement, rates of displacement and strain, and strain itself, by name."""
-_POSITIVE: dict[str, Any] = {"group": "Strain", "kind": "positive"}
-_ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
-_TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
-STRAIN = (
-    *with_uncertainty(
-        ResultQuantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
-        ResultQuantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
-        ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
-    ),
-    *with_uncertainty(
-        ResultQuantity(
-            "e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"
-        ),
-        ResultQuantity(
-            "e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"
-        ),
-    ),
-    *with_uncertainty(ResultQuantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
-    *with_uncertainty(ResultQuantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
-    *with_uncertainty(
-        ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)
-    ),
+_TENSOR, _PRINCIPAL, _SINGLE = (tuple(STRAIN.values())[part] for part in (slice(3), slice(3, 5), slice(5, None)))
+STRAIN_COLUMNS = (
+    *with_uncertainty(*_TENSOR),
+    *with_uncertainty(*_PRINCIPAL),
+    *(column for entry in _SINGLE for column in with_uncertainty(entry)),
 )
 """Strain of a frame over a gauge, in the order of exports."""
-DERIVED |= {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
 ELEMENT_STRAIN = tuple(
     replace(
         entry,
@@ -190,7 +182,7 @@ ELEMENT_STRAIN = tuple(
         axes=("element",),
         description=f"{entry.description}, constant in an element",
     )
-    for entry in STRAIN[:3]
+    for entry in _TENSOR
 )
 COMPONENTS = ("u", "v", "nodal_exx", "nodal_eyy", "nodal_exy")
 ERROR_QUANTITIES = {
@@ -213,13 +205,11 @@ ERROR_QUANTITIES["finer_mesh"] = ResultQuantity(
 _GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
 
 
-def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -> dict[str, ResultQuantity]:
-    """Return what maps show by its name, group by group; each that has an uncertainty is followed by it further down.
+def stored_map_quantities(lights: tuple[str, ...], *, with_error: bool) -> list[ResultQuantity]:
+    """Return what maps show besides displacement, strain and rates.
 
     Parameters
     ----------
-    units
-        Units of the reader, that of time included.
     lights
         Their names.
     with_error
@@ -227,10 +217,9 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
 
     Returns
     -------
-    dict of str to Quantity
+    list of ResultQuantity
     """
-    uncertainties = [entry.uncertainty for entry in DERIVED.values()]
-    derived_names = {entry.name for entry in (*DERIVED.values(), *uncertainties)}
+    derived_names = {name for entry in DERIVED.values() for name in (entry.name, entry.uncertainty.name)}
     stored = [
         replace(entry, symbol=name, description=", ".join(entry.codes) or entry.description)
         for name, entry in QUANTITIES.items()
@@ -238,14 +227,28 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     ]
     description, names = QUANTITIES["light_fraction"].description, [f"fraction of {light}" for light in lights]
     fractions = [ResultQuantity(name, _NODE, "", "", description, symbol=name, kind="fraction") for name in names]
-    quantities = [
-        *DERIVED.values(),
-        *stored,
-        *(ERROR_QUANTITIES.values() if with_error else ()),
-        *fractions,
-        *uncertainties,
-    ]
-    return {
-        entry.name: entry.with_units(units)
-        for entry in sorted(quantities, key=lambda entry: _GROUPS.index(entry.group))
-    }
+    return [*stored, *(ERROR_QUANTITIES.values() if with_error else ()), *fractions]
+
+
+def map_quantities(
+    components: tuple[str, ...], quantities: Iterable[ResultQuantity], units: Units
+) -> dict[str, ResultQuantity]:
+    """Return what maps show by its name, group by group; each that has an uncertainty is followed by it further down.
+
+    Parameters
+    ----------
+    components
+        Names of the components of the displacement.
+    quantities
+        Those of a `FieldSource`.
+    units
+        Units of the reader, that of time included.
+
+    Returns
+    -------
+    dict of str to ResultQuantity
+    """
+    derived = derived_quantities(components) | {entry.name: entry for entry in quantities if entry.group == "Strain"}
+    others = [entry for entry in quantities if entry.name not in derived]
+    entries = [*derived.values(), *others, *(entry.uncertainty for entry in derived.values())]
+    return {entry.name: entry.with_units(units) for entry in sorted(entries, key=lambda one: _GROUPS.index(one.group))}

@@ -8,7 +8,7 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,20 +21,28 @@ from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
-from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.strain import MEASURES, STRAIN, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.quantities import ELEMENT_STRAIN, MESH_DOCUMENT, QUANTITIES, STRAIN, UNKNOWN_TIME
-from rgbmidic.results.quantity import ResultQuantity
+from rgbmidic.results.quantities import (
+    DERIVED,
+    ELEMENT_STRAIN,
+    ERROR_QUANTITIES,
+    MESH_DOCUMENT,
+    QUANTITIES,
+    STRAIN_COLUMNS,
+    UNKNOWN_TIME,
+    stored_map_quantities,
+)
 from rgbmidic.results.result import Portable, Result
-from rgbmidic.settings import ScaleSettings
+from rgbmidic.settings import MeshSettings, ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
 DISPLACEMENT_QUANTITIES = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std")
-EDGE_QUANTITIES = ("u_edge_std", "v_edge_std")
-"""Displacement, its standard uncertainty and the part that the lights' bias leaves, as functions take them."""
+"""Displacement, its standard uncertainty and the part that the lights' bias leaves, in the order of records."""
 
 
 def rectification_of(
@@ -132,21 +140,6 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     return times
 
 
-def reference_frames(result: Result) -> BoolArray:
-    """Return a mask (T,) of the frames that belong to the reference.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    ndarray, shape (T,), bool
-    """
-    return np.isin(np.arange(len(result)), result.provenance["references"])
-
-
 def common_variance_fraction(result: Result) -> float:
     """Return the fraction of a frame's variance that all frames have in common (see `reference_fraction`).
 
@@ -167,31 +160,9 @@ def common_variance_fraction(result: Result) -> float:
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
-def displacements(result: Result, rectified: Rectification, frames: Iterable[int]) -> Iterator[FloatArray]:
-    """Read u, v and their uncertainties (6, N) in some frames, in rectified px."""
-    return (
-        _rectified_displacement(rectified, record) for record in result.table.iterate(DISPLACEMENT_QUANTITIES, frames)
-    )
-
-
-def _rectified_displacement(rectified: Rectification, record: Mapping[str, AnyArray]) -> FloatArray:
-    displacement = np.stack([np.asarray(record[name], np.float64) for name in DISPLACEMENT_QUANTITIES])
-    displacement[4:][np.isnan(displacement[4:]) & np.isfinite(displacement[2:4])] = (
-        0.0  # of records that were made without it
-    )
-    return np.stack(rectified.displacement(*displacement))
-
-
-def edge_std(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
-    """Return what the recovery misses near edges (2, N), in rectified px."""
-    return np.stack(
-        rectified.displacement(*(np.asarray(read[name], np.float64) for name in ("u", "v", *EDGE_QUANTITIES)))[2:]
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ResultInUnits(Portable):
-    """A result with its units.
+    """A result with its units: the `FieldSource` of displacements in a plane.
 
     Attributes
     ----------
@@ -219,19 +190,22 @@ class ResultInUnits(Portable):
     gauge: float | None = None
     measure: str = MEASURES[0]
 
-    @classmethod
-    def from_result(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
+    @staticmethod
+    def from_result(result: Result, scale: ScaleSettings | None = None) -> ResultInUnits:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
-        base, times = cls.without_times(result, scale), frame_times(result, scale)
-        if times is None or not (np.diff(times) > 0).all():
-            return base
-        return replace(base, times=times, units=replace(base.units, timed=True))
+        return result.in_units(scale).with_times()
 
     @classmethod
     def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
         rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
+
+    def with_times(self) -> Self:
+        """Read the times of all frames."""
+        if (times := self.seconds) is None or not (np.diff(times) > 0).all():
+            return self
+        return replace(self, times=times, units=replace(self.units, timed=True))
 
     components: ClassVar[tuple[str, ...]] = ("u", "v")
 
@@ -263,7 +237,25 @@ class ResultInUnits(Portable):
     @property
     def references(self) -> BoolArray:
         """Mask of the frames that belong to the reference, shape (T,)."""
-        return reference_frames(self.result)
+        return np.isin(np.arange(len(self.result)), self.result.provenance["references"])
+
+    @property
+    def common_fraction(self) -> float:
+        """Fraction of a frame's variance that all frames have in common."""
+        return common_variance_fraction(self.result)
+
+    @property
+    def exposure(self) -> float:
+        """Exposure of a frame in s; 0 where it is not known."""
+        return 1e-9 * (self.result.provenance.get("exposure_ns") or 0)
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """What a reader should know of lengths, a line each."""
+        if (camera := self.rectified.camera) is not None:
+            yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
+        if self.units.mm_per_pixel is None:
+            yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
 
     @cached_property
     def seconds(self) -> FloatArray | None:
@@ -351,15 +343,23 @@ class ResultInUnits(Portable):
 
     @cached_property
     def quantities(self) -> dict[str, ResultQuantity]:
+        """Every nodal field by its name, see `FieldSource`."""
+        error = self.result.section(MeshSettings).error
+        entries = [DERIVED["u"], DERIVED["v"], *STRAIN.values()]
+        entries += stored_map_quantities(self.result.lights, with_error=bool(error))
+        return {entry.name: entry.with_units(self.units) for entry in entries}
+
+    @cached_property
+    def columns(self) -> dict[str, ResultQuantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
         stored = [entry for entry in QUANTITIES.values() if entry.is_stackable and entry.name != "time_ns"]
         # small strain gives way to finite strain
         stored = [entry for entry in stored if not self.is_strain(entry.file_name)]
-        return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN, *ELEMENT_STRAIN)}
+        return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN_COLUMNS, *ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
-        return name in {entry.name for entry in (*STRAIN, *ELEMENT_STRAIN)}
+        return name.removesuffix("_element").removesuffix("_std") in STRAIN
 
     @property
     def length(self) -> float:
@@ -368,36 +368,66 @@ class ResultInUnits(Portable):
 
     def displacement(self, frame: int) -> Displacement:
         """Read the displacement of all nodes in a frame, in rectified px."""
-        u, v, u_std, v_std, u_bias, v_bias = next(displacements(self.result, self.rectified, [frame]))
-        return Displacement(
-            dims=("component", "node"),
-            values=np.stack([u, v]),
-            std=np.stack([u_std, v_std]),
-            bias=np.stack([u_bias, v_bias]),
-        )
+        return self._rectify(next(self.result.table.iterate(DISPLACEMENT_QUANTITIES, [frame])))
+
+    def _rectify(self, record: Mapping[str, AnyArray], *suffixes: str) -> Displacement:
+        """Return the displacement of a record in rectified px, with uncertainties whose names have these suffixes."""
+        std = [record[f"{name}{suffix}"] for suffix in suffixes or ("_std", "_bias_std") for name in self.components]
+        displacement = Displacement.in_plane(record["u"], record["v"], *std)
+        if (bias := displacement.bias) is not None:  # NaN in records that were made without it
+            no_bias = np.isnan(bias) & np.isfinite(displacement.uncertainty)
+            displacement = replace(displacement, bias=np.where(no_bias, 0.0, bias))
+        return self.rectified.displacement(displacement)
 
     def field(self, name: str, frame: int) -> Field:
-        """Read one of the `quantities` with its standard uncertainty in a frame."""
-        values = self.frame(frame)
-        std, bias = (values.get(f"{name}{suffix}") for suffix in ("_std", "_bias_std"))
-        unit = self.quantities[name].unit
-        return Field(name=name, unit=unit, dims=("node",), values=values[name], std=std, bias=bias)
+        """Read one of the `quantities` with its standard uncertainty in a frame, in the reader's unit."""
+        entry = self.quantities[name]
+        if name in STRAIN:
+            return self.gauges.strain(self.displacement(frame), self.measure)[name]
+        if name in self.components:
+            return self.units.convert(self.displacement(frame).components[self.components.index(name)])
+        record = self.result.frame(frame).values
+        if name in ERROR_QUANTITIES:
+            values = self._discretisation_error(entry, record)
+        elif entry.kind == "fraction":
+            light = self.result.lights.index(name.removeprefix("fraction of "))
+            values = np.where(record["node_status"] == 0, record["light_fraction"][:, light], np.nan)
+        else:
+            values = self._stored(record, name)
+        return Field(name=name, unit=entry.unit, dims=("node",), values=np.asarray(values, dtype=np.float64))
+
+    def _stored(self, record: Mapping[str, AnyArray], name: str) -> AnyArray:
+        """Return a quantity of a record; an uncertainty of u or v is turned into the reader's axes and unit."""
+        component, _, suffix = name.partition("_")
+        if component not in self.components:
+            return np.asarray(record[name])
+        rectified = self._rectify(record, f"_{suffix}").uncertainty
+        return np.asarray(self.length * rectified[self.components.index(component)])
+
+    def _discretisation_error(self, entry: ResultQuantity, record: Mapping[str, AnyArray]) -> FloatArray:
+        """Compute one of `ERROR_QUANTITIES` (N,); NaN in frames without."""
+        if not record["u_mesh_error"].size:
+            return np.full(len(self.result.nodes), np.nan)
+        std, error = (
+            np.array([self._stored(record, f"{base}{end}") for base in entry.base_quantities], dtype=np.float64)
+            for end in ("_std", "_mesh_error")
+        )
+        if len(error) > 1:
+            return np.asarray(np.fmax.reduce(error / std))
+        return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
 
     def frame(self, index: int) -> dict[str, AnyArray]:
-        """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
-        record = self.result.frame(index)
-        values = {name: np.asarray(record.values[name]) for name in self.quantities if name in record.values}
-        displacement = _rectified_displacement(self.rectified, values)
-        for component, (value, std, bias) in zip("uv", displacement.reshape(3, 2, -1).swapaxes(0, 1), strict=True):
-            values |= zip((component, f"{component}_std"), self.units.lengths(value, std), strict=True)
-            values[f"{component}_bias_std"] = self.length * bias
-        values |= zip(EDGE_QUANTITIES, self.length * edge_std(self.rectified, record.values), strict=True)
-        values |= strain_by_name(self.gauges.strain(*displacement, measure=self.measure))
-        gradient = self.mesh.element_gradient(displacement[:2].T)
-        elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
-        return values | {entry.name: entry.read_from(elements) for entry in ELEMENT_STRAIN}
-
-
-def strain_by_name(strain: Strain) -> dict[str, FloatArray]:
-    """Return the quantities of a strain by name."""
-    return {entry.name: entry.read_from(strain) for entry in STRAIN}
+        """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""
+        record = self.result.frame(index).values
+        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std")
+        strain = self.gauges.strain(displacement, self.measure)
+        elements = self.mesh.element_gradient(displacement.values.T)
+        columns = {name: np.asarray(record[name]) for name in self.columns if name in record}
+        for field in (*map(self.units.convert, displacement.components), *strain.values()):
+            columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
+            if field.bias is not None:
+                columns[f"{field.name}_bias_std"] = field.bias
+        for name, std in zip(self.components, self.length * edge.uncertainty, strict=True):
+            columns[f"{name}_edge_std"] = std
+        strain = strain_of_gradient(elements, np.zeros((len(elements), 4, 4)), self.measure)
+        return columns | {entry.name: strain[entry.name.removesuffix("_element")].values for entry in ELEMENT_STRAIN}

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings.conversion import (
@@ -83,6 +83,14 @@ _Coordinates3 = tuple[tuple[float, float, float], ...]
 _Coordinates4 = tuple[tuple[float, float, float, float], ...]
 
 
+STRAIN_MEASURES: dict[str, float | None] = {"green-lagrange": 1.0, "hencky": 0.0, "biot": 0.5, "engineering": None}
+"""Every strain measure with the power m of ``C = F^T F`` in ``(C^m - I) / (2 m)``, in the limit of 0 ``ln(C) / 2``
+(Hill, J Mech Phys Solids 16, 1968); None: small strain. The first is the default."""
+if TYPE_CHECKING:
+    StrainMeasure = str
+else:
+    StrainMeasure = Literal[tuple(STRAIN_MEASURES)]
+
 PROBE_NAME = re.compile(r"[^\W_](?:[^\W_]|[ .-]){0,59}")
 """Name of a probe: without ``_``, which parts it from that of the quantity in a column, nor what parts an address."""
 
@@ -150,7 +158,7 @@ class ProbeSettings(CheckedSettings):
     plane: Literal["stress", "strain"] | None = None
     terms: int = bounded(0, at_least=0, at_most=20)
     fit_tip: bool = False
-    measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
+    measure: StrainMeasure = "green-lagrange"
     window: int = bounded(0, at_least=0)
     rigid_motion: Literal["none", "tell", "remove"] = "none"
     names: tuple[tuple[str, str], ...] = ()

@@ -451,7 +451,7 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
             rim = array(page, "model('profile bands').data.ys[0]")
             known = np.isfinite(curve)
             np.testing.assert_allclose(rim[: known.sum()], (curve - 2 * expected.std[frame])[known])
-            for name, read in (("colours", Maps.from_result(wave).read("exx", frame)), ("wave_colours", expected)):
+            for name, read in (("colours", Maps.from_result(wave).read("exx", frame)), ("wave_colours", expected.data)):
                 ends = page.run(f"[model('{name}').low, model('{name}').high]")
                 assert ends == pytest.approx(robust_range(read)), "the map has those of the frame, the line of the test"
         held = parse_qs(urlsplit(driver.current_url).query)

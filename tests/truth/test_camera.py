@@ -19,7 +19,7 @@ from textures import Texture
 from rgbmidic import CameraCalibration, measure
 from rgbmidic.cli.app import app, command
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.fields import Rectification
+from rgbmidic.fields import Displacement, Rectification
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore, export_result
 from rgbmidic.results.histories import read_histories
@@ -122,24 +122,24 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     random, one = np.random.default_rng(0), np.ones(NODES)
     rectified = Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed=0))
     draws = [
-        rectified.displacement(*(field + np.array(STD)[:, None] * random.normal(size=field.shape)), one, one)[:2]
+        rectified.displacement(
+            Displacement.in_plane(*(field + np.array(STD)[:, None] * random.normal(size=field.shape)))
+        ).values
         for _ in range(200)
     ]
-    stated = rectified.displacement(*field, STD[0] * one, STD[1] * one)[2:]
+    stated = rectified.displacement(Displacement.in_plane(*field, STD[0] * one, STD[1] * one)).std
     ratio = np.std(draws, axis=0) / stated
     assert np.abs(ratio.mean(axis=1) - 1).max() < 0.02
     field[:, 7] = np.nan  # a node without data
-    np.testing.assert_array_equal(
-        np.isnan(rectified.displacement(*field, one, one)), np.broadcast_to(np.arange(NODES) == 7, (4, NODES))
-    )
+    missing = rectified.displacement(Displacement.in_plane(*field, one, one))
+    np.testing.assert_array_equal(~missing.is_measured, np.arange(NODES) == 7)
     field = moved(where, lens, MOTIONS["translation"][0])
     # the camera's own: calibrations that differ by the noise of their corners alone
     found = [Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed)) for seed in range(8)]
     exact = MOTIONS["translation"][0](np.zeros((1, 2)))[0]
     axes = turn_of(where, lens)
     errors = [
-        (one.units.mm_per_pixel or 0) * np.stack(one.displacement(*field, 0 * field[0], 0 * field[0])[:2], axis=1)
-        - exact @ axes.T
+        (one.units.mm_per_pixel or 0) * one.displacement(Displacement.in_plane(*field)).values.T - exact @ axes.T
         for one in found
     ]
     actual = np.sqrt(np.mean(np.sum(np.square(errors), axis=2)))
@@ -209,7 +209,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     viewed = Maps.from_result(result)
     assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)
     np.testing.assert_allclose(viewed.read("exx", 1).values, values["exx"])
-    np.testing.assert_allclose(viewed.read("u", 1).deformed_nodes[node], now)
+    np.testing.assert_allclose(viewed.deformed_nodes(1)[node], now)
     write_report(result, folder / "report.html")
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "lens and plane" in text

@@ -14,7 +14,7 @@ from textures import Affine, Texture
 from rgbmidic import CameraCalibration, Result, Tri3Mesh, measure_sequence
 from rgbmidic.cli.app import app
 from rgbmidic.cli.command import execute
-from rgbmidic.fields import NodalCovariance, StrainGauges
+from rgbmidic.fields import Displacement, NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
@@ -73,7 +73,7 @@ def test_gauges_are_as_long_as_the_elements_around_them() -> None:
     slopes = np.array([[0.01, 0.003], [-0.002, 0.005]])
     u, v = slopes @ MESH.nodes.T
     gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(MESH))
-    gradient, covariance = gauges.gradient(u, v, np.full_like(u, 0.01), np.full_like(u, 0.01))
+    gradient, covariance = gauges.gradient(Displacement.in_plane(u, v, np.full_like(u, 0.01), np.full_like(u, 0.01)))
     assert gradient == pytest.approx(np.broadcast_to(slopes, gradient.shape), abs=1e-12)  # 29 % had too few nodes
     std = np.sqrt(covariance[:, 0, 0])
     at_hole, far = np.hypot(*(MESH.nodes - MIDDLE).T) < HOLE + 1, np.hypot(*(MESH.nodes - MIDDLE).T) > 100

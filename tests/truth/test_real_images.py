@@ -12,7 +12,7 @@ import pytest
 from real_files import corner
 
 from rgbmidic import Solution, Status, Tri3Mesh, correlate, read_frame
-from rgbmidic.fields import Nodal, NodalCovariance, StrainGauges, at_nodes, at_pixels, make_probe
+from rgbmidic.fields import Displacement, NodalCovariance, StrainGauges, at_nodes, at_pixels, make_probe
 
 SHIFT_ERROR = 6e-5
 """px: the shifted images are copies of the pixels; 1.0e-6 found."""
@@ -108,9 +108,9 @@ def check_strain_of_three_gauges(found, commanded, region):
         inner = (
             (found.nodes > np.add(region[:2], length / 2)) & (found.nodes < np.subtract(region[2:], length / 2))
         ).all(1)
-        strain = gauges.strain(*found.displacement.T, *found.displacement_std.T, measure="engineering")
+        strain = gauges.strain(Displacement.in_plane(*found.displacement.T, *found.displacement_std.T), "engineering")
         truth = np.zeros((len(still), 3))
-        truth[:, 0] = gauges.gradient(commanded, still, still, still)[0][:, 0, 0]
+        truth[:, 0] = gauges.gradient(Displacement.in_plane(commanded, still, still, still))[0][:, 0, 0]
         measured, exact = strain.components[inner], truth[inner]
         assert (measured[:, 0] @ exact[:, 0]) / (exact[:, 0] @ exact[:, 0]) == pytest.approx(1, abs=GAUGE_GAIN)
         ratio = np.sqrt(np.mean(((measured - exact) / strain.components_std[inner]) ** 2))
@@ -172,13 +172,13 @@ def check_three_gauges_and_an_extensometer(found, start, bottom, limit):
     """The mean strain along a line is that of its ends, whatever the gauge; a longer one is more certain."""
     ends, std = np.array([start, [start[0], min(start[1] + 1200, bottom - 105)]]), []
     along = make_probe(covariance(found), "gauge", 1, ends.ravel())
-    part = [found.displacement[along.nodes].T, found.displacement_std[along.nodes].T]
-    read = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), np.concatenate(part)[:, None], strict=True)))
+    part = np.concatenate([found.displacement[along.nodes].T, found.displacement_std[along.nodes].T])
+    read = Displacement.in_plane(*part[:, None])
     _, strain = along.histories(read)
     places = np.linspace(*ends, 200)
     for length in (75, 125, 200):
         gauges = StrainGauges.at_points(covariance(found), places, length)
-        read_there = gauges.strain(*found.displacement.T, *found.displacement_std.T, measure="biot")
+        read_there = gauges.strain(Displacement.in_plane(*found.displacement.T, *found.displacement_std.T), "biot")
         assert read_there.components[:, 1].mean() == pytest.approx(strain.values[0], rel=limit)
         std.append(np.median(read_there.components_std[:, 1]))
     assert std[0] > 2 * std[1] > 3 * std[2]

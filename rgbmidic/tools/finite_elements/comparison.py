@@ -25,7 +25,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields import Displacement, MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
@@ -421,8 +421,9 @@ class Comparison:
                 values[row] = np.where(is_measured, sampling @ np.where(has_data, component, 0), np.nan)
                 variance = np.asarray(factor.multiply(factor).sum(axis=1)).ravel()
                 std[row] = np.where(is_measured, np.sqrt(variance), np.nan)
-            strain = gauges.strain(*displacement, *stds[0], *stds[1])
-            values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
+            strain = gauges.strain(Displacement(values=displacement, std=stds[0], bias=stds[1]))
+            for row, name in enumerate(("exx", "eyy", "exy"), start=2):
+                values[row, node], std[row, node] = strain[name].values[gauge], strain[name].uncertainty[gauge]
         return values, np.stack(noise_std)
 
     def _agreement(

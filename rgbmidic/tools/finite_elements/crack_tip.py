@@ -21,8 +21,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import InputError
-from rgbmidic.fields.cracks import comma_separated, crack_faces, nearest_node, select_nodes
-from rgbmidic.fields.history import History, Nodal, ProbeQuantity, histories_of
+from rgbmidic.field import Displacement, Field
+from rgbmidic.fields.cracks import comma_separated, crack_faces, nearest_node
+from rgbmidic.fields.history import of_probe
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.units import Units
@@ -321,7 +322,7 @@ class CrackTip:
     def _is_sufficient(self, is_measured: BoolArray) -> bool:
         return bool(is_measured.sum() >= self.min_nodes and self._gap(self.points[is_measured]) <= _CONSTANTS.gap_deg)
 
-    def read(self, nodal: Nodal) -> StressIntensity:
+    def read(self, displacement: Displacement) -> StressIntensity:
         """Fit the series to the displacements of the `nodes` in every frame.
 
         The weights are the inverse covariance of the nodes, neighbours correlated. Where the chi-square is above its
@@ -329,7 +330,9 @@ class CrackTip:
         to the least N from which all those beyond it lower no frame's chi-square by more than noise would, once in a
         thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
         """
-        fields = nodal.fields.swapaxes(0, 1)
+        std = displacement.uncertainty
+        bias = np.zeros_like(std) if displacement.bias is None else displacement.bias
+        fields = np.concatenate([displacement.values, std, bias]).swapaxes(0, 1)
         is_measured: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._is_sufficient(row) for row in is_measured])
         data = {frame: _Weighted(self, fields[frame], is_measured[frame]) for frame in frames.tolist()}
@@ -377,9 +380,9 @@ class CrackTip:
                 return terms
         return most_terms
 
-    def histories(self, nodal: Nodal) -> list[History]:
+    def histories(self, displacement: Displacement) -> list[Field]:
         """Compute the stress intensity factors, the T-stress, the fitted tip's way and the chi-square of the fit."""
-        s, w = self.read(nodal), self.williams
+        s, w = self.read(displacement), self.williams
         tip, radii = comma_separated(self.tip.round(1)), comma_separated(self.radii)
         tip_text = "its place along the crack is fitted" if w.fit_tip else "its place is that of the mesh"
         note = (
@@ -392,14 +395,14 @@ class CrackTip:
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
             )
-        quantities: list[ProbeQuantity] = [
-            ("K1", "MPa √m", s.factors[:, 0], s.factors_std[:, 0]),
-            ("K2", "MPa √m", s.factors[:, 1], s.factors_std[:, 1]),
-            ("T", "MPa", s.t_stress, s.t_stress_std),
+        quantities = [
+            Field(name="K1", unit="MPa √m", values=s.factors[:, 0], std=s.factors_std[:, 0]),
+            Field(name="K2", unit="MPa √m", values=s.factors[:, 1], std=s.factors_std[:, 1]),
+            Field(name="T", unit="MPa", values=s.t_stress, std=s.t_stress_std),
         ]
         if s.extension is not None:
-            quantities.append(("extension", "px", s.extension, s.extension_std))
-        return histories_of(self.name, [*quantities, ("chi_square", "", s.chi_square, None)], note)
+            quantities.append(Field(name="extension", unit="px", values=s.extension, std=s.extension_std))
+        return of_probe(self.name, [*quantities, Field(name="chi_square", values=s.chi_square)], note)
 
 
 class _Weighted:
@@ -496,7 +499,7 @@ def tip_probe(covariance: NodalCovariance, name: str, *place: float, settings: P
 def stress_intensity(
     nodes: FloatArray,
     elements: npt.NDArray[np.int32],
-    displacement: Nodal,
+    displacement: Displacement,
     tip: tuple[float, float],
     radii: tuple[float, float],
     williams: Williams,
@@ -510,7 +513,7 @@ def stress_intensity(
     elements : ndarray, shape (E, 3)
         Node indices.
     displacement
-        Of all nodes, each field (T, N), px.
+        Of all nodes, shape (2, T, N), px.
     tip
         Point (x, y) at the tip, px.
     radii
@@ -534,7 +537,7 @@ def stress_intensity(
     >>> region = Region.from_rectangle((0, 0, 140, 140), shape=(160, 160))
     >>> mesh = Tri3Mesh.from_region(region, element_size=16, cracks=[[(0, 70), (70, 70)]])
     >>> zero = np.zeros((1, len(mesh.nodes)))
-    >>> still = Nodal(u=zero, v=zero, u_std=zero + 0.01, v_std=zero + 0.01)
+    >>> still = Displacement.in_plane(zero, zero, zero + 0.01, zero + 0.01)
     >>> steel = Williams(youngs_modulus=210e3, poissons_ratio=0.3, plane="stress", units=Units(mm_per_pixel=0.05))
     >>> result = stress_intensity(mesh.nodes, mesh.elements, still, (70, 70), (32, 68), steel)
     >>> np.abs(result.factors).max() < 1e-9
@@ -542,4 +545,4 @@ def stress_intensity(
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     probe = CrackTip(covariance, "the tip", *tip, *radii, williams=williams)
-    return probe.read(select_nodes(displacement, probe.nodes))
+    return probe.read(displacement.isel(node=probe.nodes))

@@ -15,7 +15,7 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results import QUANTITIES, Channels, Histories, History, Maps, Profile, Wave
+from rgbmidic.results import QUANTITIES, Channels, Field, Histories, Maps, Profile, Wave
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.figures import field_colours, select_evenly
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Panel = tuple[str, Sequence[History]]
+Panel = tuple[str, Sequence[Field]]
 """Label of a panel and the quantities that it shows over the time; without a label: one over the other."""
 _KIND_PATTERN = re.compile(
     "(?:^|_)(velocity|acceleration|strain_rate|rate|strain|extension|opening|sliding|direction|stress)(_before|_after)?$"
@@ -182,7 +182,7 @@ def history_panels(histories: Histories) -> list[Panel]:
 
     Where a stress is known, a last panel has it and the strain.
     """
-    panels: dict[str, list[History]] = {}
+    panels: dict[str, list[Field]] = {}
     for quantity in histories.quantities:
         kind = quantity.name  # of a channel that is not a probe's
         if quantity.std is not None or quantity.name == "stress":
@@ -257,7 +257,7 @@ def _draw_legend(axis: Axes, count: int) -> None:
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=size, title=title, title_fontsize=size)
 
 
-def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History]) -> None:
+def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[Field]) -> None:
     """Draw quantities over the times (T,), with bands of two standard uncertainties; their values set the limits."""
     colours, finite_values = dict[str, Any](), list[FloatArray]()
     step = -(-len(quantities) // _MAX_NAMES)  # a crack has a quantity a node

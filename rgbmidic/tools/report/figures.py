@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -245,10 +246,9 @@ class MapDrawer:
 
         panels = []
         for name in names:
-            map_values = self.maps.read(name, frame)
-            panels.append((self.maps.field(name), map_values.values, map_values.std))
-            if std and np.isfinite(map_values.std).any():
-                panels.append((self.maps.field(f"{name}_std"), map_values.std, np.full_like(map_values.std, np.nan)))
+            panels.append(field := self.maps.read(name, frame))
+            if std and np.isfinite(field.uncertainty).any():
+                panels.append(replace(field, name=f"{name}_std", values=field.uncertainty, std=None))
         if len(panels) not in self._figures:
             self._figures[len(panels)] = self._panels(len(panels))
         figure, reference_count = (
@@ -259,17 +259,19 @@ class MapDrawer:
         note = "; ".join(filter(None, dict.fromkeys(self.maps.processing_note(name) for name in names)))
         figure.texts[0].update({"text": f"{title}\n{note}" if note else title, "fontsize": 8 if note else 10})
         with mpl.rc_context(style.STYLE):
-            for axis, (field, values, uncertainty) in zip(figure.axes, panels, strict=True):
+            for axis, field in zip(figure.axes, panels, strict=True):
+                quantity, uncertainty = self.maps.field(field.name), field.uncertainty
                 artists = (*axis.lines, *axis.patches, *axis.texts, *axis.artists, *axis.collections)
                 for artist in (*axis.images[reference_count:], *artists):
                     artist.remove()
-                colour_values = style.ordinary_values(values, uncertainty)
-                norm = style.colour_scale(colour_values, positive=field.is_logarithmic) if colour_values.size else None
-                norm = Normalize(*field.fixed_range) if field.fixed_range else norm
-                self._show_field(axis, values, norm, field)
-                axis.set_title(style.literal(field.label))
+                colour_values = style.ordinary_values(field.values, uncertainty)
+                positive = quantity.is_logarithmic
+                norm = style.colour_scale(colour_values, positive=positive) if colour_values.size else None
+                norm = Normalize(*quantity.fixed_range) if quantity.fixed_range else norm
+                self._show_field(axis, field.values, norm, quantity)
+                axis.set_title(style.literal(quantity.label))
                 if hatched and np.isfinite(uncertainty).any():
-                    margin = self._points_in_elements.linear(np.abs(values) - 2 * uncertainty)
+                    margin = self._points_in_elements.linear(np.abs(field.values) - 2 * uncertainty)
                     with np.errstate(invalid="ignore"):
                         axis.contourf(
                             *self._grid,

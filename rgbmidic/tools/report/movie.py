@@ -183,11 +183,16 @@ class FieldMovie:
         for name in self.fields:
             colour_values, field = [], maps.field(name)
             for frame in frames:
-                map_values = maps.read(name, frame)
-                colour_values.append(style.ordinary_values(map_values.values, map_values.std))
-                deformed = map_values.deformed_nodes[np.isfinite(map_values.deformed_nodes).all(axis=1)]
-                if self.images is not None and len(deformed):
-                    corners.append(np.stack([deformed.min(axis=0), deformed.max(axis=0)]))
+                nodal = maps.read(name, frame)
+                colour_values.append(style.ordinary_values(nodal.values, nodal.uncertainty))
+                if self.images is not None:
+                    deformed = maps.deformed_nodes(frame)
+                    deformed = deformed[np.isfinite(deformed).all(axis=1)]
+                    corners += (
+                        [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
+                        if len(deformed)
+                        else []
+                    )
             finite_values = np.concatenate(colour_values)
             if not finite_values.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
@@ -370,13 +375,12 @@ class _Canvas:
             axis.draw_artist(self._cursor)
         page: npt.NDArray[np.uint32] = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
         grey = self._reference if movie.images is None else self._resample_to_panel(movie.images(frame))
+        nodes = result.nodes if movie.images is None else movie.maps.deformed_nodes(frame)
+        nodes = (nodes - self._origin) / self._step
         for (rows, columns), field_panel, packed in zip(self._boxes, self._panels, self._packed, strict=True):
-            map_values = movie.maps.read(field_panel.field.name, frame)
             panel = np.empty(self._size, dtype=np.uint32)
-            nodes = (
-                (map_values.deformed_nodes if movie.images is not None else result.nodes) - self._origin
-            ) / self._step
-            vertices, elements = movie.maps.triangulate(field_panel.field, np.column_stack([nodes, map_values.values]))
+            nodal = movie.maps.read(field_panel.field.name, frame).values
+            vertices, elements = movie.maps.triangulate(field_panel.field, np.column_stack([nodes, nodal]))
             x, y, values = np.ascontiguousarray(vertices.T)
             paint_field(
                 panel, grey, x, y, elements, values, *map(float, field_panel.colour_range), packed, self._grey_part,

@@ -68,7 +68,7 @@ class CarriedTable(FrameTable):
             yield values
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class LeftResult(Result):
     """The left camera's result of a stereo test; `in_units` is in three dimensions.
 

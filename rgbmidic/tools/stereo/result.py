@@ -137,6 +137,22 @@ class StereoResult:
         except (OSError, KeyError) as error:
             raise ResultError(f"{self.path} is damaged: {error}") from None
 
+    def at(self, name: str, index: int) -> AnyArray:
+        """Read a quantity of one frame, or that of the undeformed surface.
+
+        Parameters
+        ----------
+        name
+            Name of the quantity.
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        ndarray
+        """
+        return self[name] if QUANTITIES[name] in SHARED else self.frame([name], index)[name]
+
     def camera(self, side: Literal["left", "right"]) -> Result:
         """Open the ordinary result of a camera.
 

@@ -28,7 +28,6 @@ from rgbmidic.pipeline.source import Series, open_frames
 from rgbmidic.results import Result, common_variance_fraction, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result
-from rgbmidic.results.result_in_units import reference_frames
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
@@ -220,7 +219,7 @@ def measure_stereo(
 
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    doubts, is_reference = list[str](), reference_frames(first)
+    doubts, is_reference = list[str](), first.in_units().references
     times = frame_times(first)
     write_complete(
         file,

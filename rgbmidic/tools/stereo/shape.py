@@ -169,19 +169,14 @@ class Shape:
             "normal": surface.normal,
             "tilt": surface.tilt,
             "tilt_std": surface.tilt_std,
-            "direction": strain.direction_deg,
-            "direction_std": strain.direction_std_deg,
             "left_status": np.asarray(left["node_status"]),
             "right_status": np.asarray(right["node_status"]),
         }
         values |= dict(zip(("u_bias_std", "v_bias_std", "w_bias_std"), bias.T, strict=True))
-        for names, array, error in (
-            ("uvw", displacement, std),
-            (("exx", "eyy", "exy"), strain.components, strain.components_std),
-            (("e1", "e2"), strain.principal, strain.principal_std),
-        ):
-            for column, name in enumerate(names):
-                values |= {name: array[:, column], f"{name}_std": error[:, column]}
+        for column, name in enumerate("uvw"):
+            values |= {name: displacement[:, column], f"{name}_std": std[:, column]}
+        for name in ("exx", "eyy", "exy", "e1", "e2", "direction"):
+            values |= {name: strain[name].values, f"{name}_std": strain[name].uncertainty}
         return values
 
     def doubts(self, changes: FloatArray, expected: FloatArray) -> Iterator[str]:

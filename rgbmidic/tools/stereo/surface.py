@@ -1,21 +1,19 @@
-"""Surface strain in space: tangents of the undeformed and of the deformed surface over virtual strain gauges.
+"""Surface strain and attitude in space: virtual strain gauges on the undeformed and on the deformed surface.
 
-A gauge fits planes to the three coordinates of its nodes over the left frame (`rgbmidic.fields.StrainGauges`): the
-columns of A (3, 2) are the tangents of the undeformed surface, those of B of the deformed one. With the orthonormal
-axes T (3, 2) of the undeformed tangent plane and ``M = (T^T A)^-1`` the deformation gradient of the surface is
-``F = B M`` (3, 2), and ``E = (F^T F - I) / 2`` its Green-Lagrange strain in these axes. Turned into the deformed
-tangent plane by the polar decomposition ``F = Q U``, ``Q^T F`` is a gradient in the plane, of which
-`rgbmidic.fields.strain_of_gradient` takes strain and uncertainty.
+A gauge fits planes to the three coordinates of its nodes over the left frame (`rgbmidic.fields.StrainGauges`), whose
+slopes are the tangents of the surface (`rgbmidic.fields.tangent_plane`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rgbmidic.field import Displacement
 from rgbmidic.fields import NodalCovariance, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.strain import length_of
+from rgbmidic.fields.tangent_plane import in_tangent_plane, measured_slopes, normals, tangent_axes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
@@ -48,15 +46,12 @@ class SurfaceGauges:
     Attributes
     ----------
     gauges
-        On the mesh in px of the left frame.
-    points : ndarray, shape (N, 3)
-        The undeformed surface at the nodes, mm.
+        On the mesh in px of the left frame, with the undeformed surface in space.
     measure
         Strain measure, as of `rgbmidic.fields.strain_of`.
     """
 
     gauges: StrainGauges
-    points: FloatArray
     measure: str = "green-lagrange"
 
     @classmethod
@@ -80,8 +75,8 @@ class SurfaceGauges:
         -------
         SurfaceGauges
         """
-        gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh), length)
-        return cls(gauges=gauges, points=points, measure=measure)
+        covariance = replace(NodalCovariance.from_mesh(mesh), surface=points)
+        return cls(gauges=StrainGauges.at_nodes(covariance, length), measure=measure)
 
     def strain(self, displacement: FloatArray, covariance: FloatArray) -> SurfaceStrain:
         """Compute strain and attitude of the deformed surface.
@@ -98,77 +93,25 @@ class SurfaceGauges:
         -------
         SurfaceStrain
         """
-        gauges = self.gauges
-        measured = np.asarray(np.isfinite(displacement).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-        weights = gauges.weights(measured)
-        fields = np.where(measured[:, None], displacement, 0.0)
-        spread = np.where(measured[:, None, None], covariance, 0.0)
-
-        def total(values: FloatArray) -> FloatArray:
-            return np.asarray(np.add.reduceat(values, gauges.starts[:-1], axis=0))
-
-        tangents, slopes = (  # (G, 3, 2)
-            total(weights.T[:, None] * nodal[gauges.nodes][..., None]) for nodal in (self.points, fields)
+        std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+        field = Displacement(
+            unit="mm",
+            dims=("component", "node"),
+            values=displacement.T,
+            std=std.T,
+            covariance=np.moveaxis(covariance, 0, 2),
         )
-        products = weights[[0, 0, 1, 1]] * weights[[0, 1, 0, 1]]
-        inflation = gauges.inflation[:, [0, 2, 2, 1]]
-        sums = total(products.T[..., None, None] * spread[gauges.nodes][:, None]) * inflation[..., None, None]
-        # (G, 2, 2, 3, 3) -> of slopes row by row: (G, 3, 2, 3, 2)
-        of_slopes = sums.reshape(-1, 2, 2, 3, 3).transpose(0, 3, 1, 4, 2)
-
-        return surface_strain(tangents, slopes, of_slopes, self.measure)
-
-
-def surface_strain(tangents: FloatArray, slopes: FloatArray, covariance: FloatArray, measure: str) -> SurfaceStrain:
-    """Compute the strain of surfaces with these tangents.
-
-    Parameters
-    ----------
-    tangents, slopes : ndarray, shape (G, 3, 2)
-        Derivatives of the undeformed surface and of the displacement along two directions of the left frame.
-    covariance : ndarray, shape (G, 3, 2, 3, 2)
-        Of the slopes.
-    measure
-        Strain measure.
-
-    Returns
-    -------
-    SurfaceStrain
-    """
-    valid = np.asarray(np.isfinite(slopes + tangents).all(axis=(1, 2)))
-    flat = np.eye(3)[:, :2]
-    tangents, slopes = (np.where(valid[:, None, None], array, flat) for array in (tangents, slopes))
-    deformed = tangents + slopes
-    axes = _tangent_axes(tangents)
-    to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
-    gradient = deformed @ to_axes
-    left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
-    turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
-    spread = np.einsum("gdb,gidje,gef->gibjf", to_axes, covariance, to_axes, optimize=True)
-    spread_in_plane = np.einsum("gai,gibjf,gcj->gabcf", turn, spread, turn, optimize=True)
-    in_plane = turn @ gradient - np.eye(2)
-    normal = np.cross(deformed[:, :, 0], deformed[:, :, 1])
-    normal *= (np.where(normal[:, 2] < 0, -1, 1) / np.linalg.norm(normal, axis=1))[:, None]
-    # to first order the normal turns by the slopes along it
-    of_tilt = np.einsum("gi,gibjf,gj->gbf", normal, spread, normal)
-    sine, sine_std = length_of(np.einsum("gi,gia->ga", normal, axes), of_tilt)
-    tilt = np.arcsin(np.minimum(sine, 1))
-    for array in (in_plane, spread_in_plane, normal, tilt):
-        array[~valid] = np.nan
-    return SurfaceStrain(
-        strain=strain_of_gradient(in_plane, spread_in_plane.reshape(-1, 4, 4), measure),
-        normal=normal,
-        tilt=np.degrees(tilt),
-        tilt_std=np.degrees(np.where(valid, sine_std, np.nan)),
-    )
-
-
-def _tangent_axes(tangents: FloatArray) -> FloatArray:
-    """Return orthonormal axes (G, 3, 2) of tangent planes: x projected onto each, and the normal to it in the plane."""
-    basis, _ = np.linalg.qr(tangents)
-    along = np.einsum("gia,ga->gi", basis, basis[:, 0])  # x projected
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-    normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal *= np.where(normal[:, 2:] < 0, -1, 1)
-    return np.stack([along, np.cross(normal, along)], axis=2)
+        slopes, of_slopes = self.gauges.slopes_of(field)
+        tangents = self.gauges.tangents(field.is_measured)
+        strain = strain_of_gradient(*in_tangent_plane(tangents, slopes, of_slopes), self.measure)
+        tangents, slopes, valid = measured_slopes(tangents, slopes)
+        axes, normal = tangent_axes(tangents), normals(tangents + slopes)
+        # to first order the normal turns by the slopes along it
+        to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
+        change = np.einsum("gi,gdf->gfid", normal, to_axes).reshape(-1, 2, 6)
+        of_tilt = change @ np.where(valid[:, None, None], of_slopes, 0) @ change.transpose(0, 2, 1)
+        sine, sine_std = length_of(np.einsum("gi,gia->ga", normal, axes), of_tilt)
+        arrays = np.degrees(np.arcsin(np.minimum(sine, 1))), np.degrees(sine_std)
+        normal[~valid] = np.nan
+        tilt, tilt_std = (np.where(valid, array, np.nan) for array in arrays)
+        return SurfaceStrain(strain=strain, normal=normal, tilt=tilt, tilt_std=tilt_std)

@@ -6,21 +6,38 @@ space.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Rectification, Units
+from rgbmidic.field import Displacement, Field
+from rgbmidic.fields import NodalCovariance, Rectification, StrainGauges, Units
+from rgbmidic.fields.strain import STRAIN
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results import ResultQuantity
+from rgbmidic.results.quantities import derived_quantities, stored_map_quantities
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.tools.stereo.stereo_file import QUANTITIES
+from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     from rgbmidic.tools.stereo.left_result import LeftResult
+
+
+_SPACE = {
+    **dict.fromkeys(("x", "y", "z"), "displacement"),
+    "tilt": "strain",
+    "epipolar_common": "displacement",
+    "epipolar_change": "displacement",
+}
+"""Quantities of the file, with their standard uncertainty, that maps show as they are, with their kinds."""
+_ROUNDING = 1e-6
+"""Part of a variance that is left at least where the calibration's is taken off it: single precision (derived)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,8 +78,12 @@ class SurfaceInUnits(ResultInUnits):
                 f"lengths of {result.path} are those in space, mm; for px read the result of a camera, "
                 f"{result.left.path}"
             )
-        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-        units = Units(mm_per_pixel=1.0, mm_per_pixel_std=float(result.stereo.attributes["relative_length_std"]))
+        mesh, points = Tri3Mesh(nodes=result.nodes, elements=result.elements), _points(result)
+        corners = points[mesh.elements]
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        mean_scale = float(np.sqrt(areas.sum() / mesh.areas.sum()))
+        relative = float(result.stereo.attributes["relative_length_std"])
+        units = Units(mm_per_pixel=mean_scale, mm_per_pixel_std=mean_scale * relative)
         flat = Rectification(camera=None, image=mesh, mesh=mesh, units=units)
         times = np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=units, times=times, rectified=flat)
@@ -70,4 +91,114 @@ class SurfaceInUnits(ResultInUnits):
     @cached_property
     def points(self) -> FloatArray:
         """Nodes (N, 3) on the undeformed surface, mm."""
-        return np.stack([self.result.stereo[name] for name in "xyz"], axis=1)
+        return _points(self.result)
+
+    @cached_property
+    def covariance(self) -> NodalCovariance:
+        """Covariance of the nodes' errors, with the surface in space."""
+        return replace(NodalCovariance.from_mesh(self.mesh), surface=self.points)
+
+    @cached_property
+    def gauges(self) -> StrainGauges:
+        """Virtual strain gauges around the nodes; where no length is stated, with that of the file."""
+        return StrainGauges.at_nodes(self.covariance, self.gauge or float(self.result.stereo.attributes["gauge_px"]))
+
+    @property
+    def axes(self) -> tuple[str, float]:
+        """Pictures are those of the left camera: in px."""
+        return "px", 1.0
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """What a reader should know of lengths, a line each."""
+        attributes = self.result.stereo.attributes
+        yield f"u, v, w are along the axes {attributes['axes']}; lengths are those in space"
+        yield f"the calibration leaves {100 * float(attributes['relative_length_std']):.2g} % of every length"
+
+    @cached_property
+    def quantities(self) -> dict[str, ResultQuantity]:
+        """Every nodal field by its name: of the surface, and what the left camera's result has of its match."""
+        derived = derived_quantities(self.components)
+        # px are of the frames here: no length on the surface, which readers turn them into
+        space = [replace(QUANTITIES[name], symbol=name, kind=kind) for name, kind in _SPACE.items()]
+        errors = [QUANTITIES[f"{name}_std"] for name in _SPACE]
+        space, errors = (
+            [replace(one, unit=one.unit.replace("px", "pixel")) for one in part] for part in (space, errors)
+        )
+        left = stored_map_quantities(self.result.lights, with_error=False)
+        left = [entry for entry in left if not entry.name.startswith(("u_", "v_", "nodal_"))]
+        entries = [*(derived[name].with_units(self.units) for name in self.components), *STRAIN.values()]
+        return {entry.name: entry for entry in (*entries, *space, *left, *errors)}
+
+    def displacement(self, frame: int) -> Displacement:
+        """Read the displacement of all nodes in a frame, mm, without the part of the calibration in its uncertainty."""
+        values, total, bias = self._read(frame)
+        covariance = total - self._calibration_covariance(values)
+        std = np.sqrt(np.maximum(np.einsum("nii->in", covariance), _ROUNDING * np.einsum("nii->in", total)))
+        return Displacement(
+            unit="mm",
+            dims=("component", "node"),
+            values=values.T,
+            std=std,
+            bias=np.minimum(bias.T, std),
+            covariance=np.moveaxis(covariance, 0, 2),
+        )
+
+    def field(self, name: str, frame: int) -> Field:
+        """Read one of the `quantities` with its standard uncertainty in a frame."""
+        base = name.removesuffix("_std")
+        if base in _SPACE:
+            entry, stereo = self.quantities[name], self.result.stereo
+            arrays = [np.asarray(stereo.at(one, frame), dtype=np.float64) for one in (name, f"{base}_std")]
+            std = arrays[1] if name == base else None
+            return Field(name=name, unit=entry.unit, dims=("node",), values=arrays[0], std=std)
+        if name in self.components:
+            displacement = self.displacement(frame)
+            component = displacement.components[self.components.index(name)]
+            common = self.calibration_std(dict(zip(self.components, displacement.values, strict=True)))[name]
+            return replace(component, std=np.hypot(component.uncertainty, common))
+        return super().field(name, frame)
+
+    def frame(self, index: int) -> dict[str, AnyArray]:
+        """Return displacement, strain, and what the left camera's record has of the match, each in its type."""
+        record, displacement = self.result.frame(index).values, self.displacement(index)
+        columns = {name: np.asarray(record[name]) for name in ("number", "status", "node_status", "misfit")}
+        fields = [self.field(name, index) for name in self.components]
+        for field in (*fields, *self._strain(displacement).values()):
+            columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
+        return columns
+
+    def calibration_std(self, vector: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Compute the standard uncertainty that the calibration leaves in a displacement or its rate.
+
+        Parameters
+        ----------
+        vector
+            u, v and w of the shape (...).
+
+        Returns
+        -------
+        dict of str to ndarray, shape (...)
+        """
+        values = np.stack([vector[name] for name in self.components], axis=-1)
+        errors = np.einsum("ijk,...j->i...k", self._gain, values)
+        return dict(zip(self.components, np.linalg.norm(errors, axis=-1), strict=True))
+
+    @property
+    def _gain(self) -> FloatArray:
+        return np.asarray(self.result.stereo.attributes["calibration_gain"], dtype=np.float64)
+
+    def _calibration_covariance(self, values: FloatArray) -> FloatArray:
+        errors = np.einsum("ijk,nj->nik", self._gain, values)
+        return np.asarray(errors @ errors.transpose(0, 2, 1))
+
+    def _read(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Read the displacement (N, 3), its covariance (N, 3, 3) and the lights' bias (N, 3)."""
+        biases = [f"{name}_bias_std" for name in self.components]
+        arrays = self.result.stereo.frame([*self.components, "displacement_covariance", *biases], frame)
+        values, bias = (np.stack([arrays[name] for name in names], axis=1) for names in (self.components, biases))
+        return values, np.asarray(arrays["displacement_covariance"], dtype=np.float64), bias.astype(np.float64)
+
+
+def _points(result: LeftResult) -> FloatArray:
+    return np.stack([result.stereo[name] for name in "xyz"], axis=1)

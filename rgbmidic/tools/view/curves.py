@@ -13,7 +13,7 @@ from bokeh.document import Document
 from bokeh.events import Pan, PanEnd, PanStart
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.fields import History
+from rgbmidic.fields import Field
 from rgbmidic.results import Channels, Histories, Result
 from rgbmidic.results.histories import empty_histories, read_histories, with_channels
 from rgbmidic.settings import ProbeSettings, ScaleSettings
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def group_quantities(histories: Histories, names: Iterable[str]) -> dict[str, list[History]]:
+def group_quantities(histories: Histories, names: Iterable[str]) -> dict[str, list[Field]]:
     """Group the same quantity of the probes of some names, by its name and unit; channels are alone."""
-    by_label: dict[str, list[History]] = {}
+    by_label: dict[str, list[Field]] = {}
     for quantity in histories.quantities:
         if quantity.name.endswith(("_before", "_after")):  # single frames, no curve
             continue
@@ -42,7 +42,7 @@ def group_quantities(histories: Histories, names: Iterable[str]) -> dict[str, li
     return by_label
 
 
-def uncertainty_band(x: FloatArray, quantity: History) -> tuple[list[FloatArray], list[FloatArray]]:
+def uncertainty_band(x: FloatArray, quantity: Field) -> tuple[list[FloatArray], list[FloatArray]]:
     """Outline two standard uncertainties on both sides, for each stretch of frames without a gap: their x and y."""
     if quantity.std is None:
         return [], []
@@ -63,7 +63,7 @@ def _read_probes(
     return read_histories(result, settings_of_marks(marks, gauge, result.section(ProbeSettings), measure), scale=scale)
 
 
-def _probe(quantity: History, names: Iterable[str]) -> str:
+def _probe(quantity: Field, names: Iterable[str]) -> str:
     """Return the name of the probe, of some names, that a quantity is of; empty: it is a channel."""
     return max((name for name in names if quantity.name.startswith(f"{name}_")), key=len, default="")
 
@@ -160,7 +160,7 @@ class CurvePanel:
                 self._reader.submit(work, self._receive)
             else:
                 self._reader.cancel()
-                self._receive(lambda: empty_histories(fields.result) if channels_only else None)
+                self._receive(lambda: empty_histories(fields.result.in_units()) if channels_only else None)
         elif self._drawn_state != (fields.channels, view.along, view.beside):
             self._combine()
             self.draw()
@@ -211,7 +211,7 @@ class CurvePanel:
         self.offer_choices()
         self.mark_frame(self._fields.view.frame)
 
-    def _combine(self) -> dict[str, list[History]]:
+    def _combine(self) -> dict[str, list[Field]]:
         """Add the channels as they are stated to the probes; what is wrong with them is reported. Return the groups."""
         settings, view, text = self._fields.channels, self._fields.view, ""
         self.histories, self.channels, self._drawn_state = self._probed, None, (settings, view.along, view.beside)
@@ -303,7 +303,7 @@ class CurvePanel:
         return int(self.histories.frames[np.nanargmin(np.abs(self._x[0] - x))])
 
     @property
-    def _x_quantity(self) -> History | None:
+    def _x_quantity(self) -> Field | None:
         """The quantity along x; None: the time."""
         quantities = () if self.histories is None else self.histories.quantities
         return next((quantity for quantity in quantities if quantity.name == self._fields.view.along), None)

@@ -13,9 +13,9 @@ from typing import Any, cast
 import numpy as np
 
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.fields import MEASURES, Area, Mean, Nodal, make_probe
+from rgbmidic.fields import MEASURES, Area, Displacement, Field, Mean, make_probe
 from rgbmidic.fields.strain import shortest_gauge
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Result, ResultQuantity
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Profile, Result, ResultQuantity
 from rgbmidic.results.histories import convert_history
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
@@ -33,7 +33,7 @@ from rgbmidic.tools.view.picture import (
 )
 from rgbmidic.tools.view.url_state import EXTRA_FIELDS, UNCERTAINTY, ViewState
 from rgbmidic.tools.view.widgets import warning
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import AnyArray, FloatArray
 
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
@@ -133,14 +133,24 @@ class FieldsInView:
         self.result = result
         self._use_maps(replace(self.maps, result=result))
 
-    def values(self, name: str) -> MapValues:
+    def values(self, name: str) -> Field:
         """Read a field in the frame in view."""
         return self._read_field(name, self.view.frame)
 
     @property
-    def displacement(self) -> FloatArray:
-        """u, v and their uncertainties (4, N) in the frame in view, px."""
+    def displacement(self) -> Displacement:
+        """Displacement (2, N) in the frame in view, px."""
         return self._read_displacement(self.view.frame)
+
+    @property
+    def deformed_nodes(self) -> FloatArray:
+        """Deformed places (N, 2) of the nodes in the frame in view, px of the image."""
+        return self.maps.deformed_nodes(self.view.frame)
+
+    @property
+    def node_status(self) -> AnyArray:
+        """Status (N,) of the nodes in the frame in view."""
+        return np.asarray(next(self.result.iterate("node_status", [self.view.frame])))
 
     @property
     def names(self) -> list[str]:
@@ -179,7 +189,7 @@ class FieldsInView:
         if view.range == "test":
             low, high = self._test_range(name)
         else:
-            low, high = robust_range(profile or self.values(name)) or (0.0, 1.0)
+            low, high = robust_range(profile.data if profile else self.values(name)) or (0.0, 1.0)
         is_symmetric = view.symmetric and field.is_signed
         return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if is_symmetric else (low, high)
 
@@ -193,7 +203,7 @@ class FieldsInView:
         )
         field_palette = palette_name(field, symmetric=view.symmetric)
         vertices, elements = self.maps.triangulate(field, np.column_stack([self.nodes, values.values]))
-        hatch_margin = (np.abs(values.values) - 2 * values.std)[:, None]
+        hatch_margin = (np.abs(values.values) - 2 * values.uncertainty)[:, None]
         return Overlay(
             nodes=vertices[:, :2],
             elements=elements,
@@ -208,7 +218,7 @@ class FieldsInView:
     @property
     def nodes(self) -> FloatArray:
         """Places (N, 2) at which the nodes are drawn."""
-        return self.values(self.view.field).deformed_nodes if self.view.over == "deformed" else self.result.nodes
+        return self.deformed_nodes if self.view.over == "deformed" else self.result.nodes
 
     @cached_property
     def _reference(self) -> Picture:
@@ -256,8 +266,9 @@ class FieldsInView:
         lines.append(f"<b>{html.escape(field.label)}</b>: {html.escape(field.description.partition(':')[0])}")
         values = self.values(field.name)
         if extreme_nodes := self.extremes:
+            std = values.uncertainty
             texts = [
-                f"{name} {field.format(values.values[node], values.std[node])} at {maps.physical.position_text(x, y)}"
+                f"{name} {field.format(values.values[node], std[node])} at {maps.physical.position_text(x, y)}"
                 for name, node, (x, y) in zip(
                     ("smallest", "largest"), extreme_nodes, result.nodes[[*extreme_nodes]], strict=True
                 )
@@ -280,7 +291,7 @@ class FieldsInView:
         nodes, texts = element[0], []
         mean = Mean.over(physical.covariance, "the pointer", [element[1] @ physical.mesh.nodes[nodes]])
         for name in self.names:
-            field, blank = self.maps.quantities[name], self.values(name).status[nodes].max()
+            field, blank = self.maps.quantities[name], self.node_status[nodes].max()
             value, std = self._mean(field, mean)
             reason = (
                 f" ({_REASONS[blank] if blank else 'a node beside it has no data'})" if not np.isfinite(value) else ""
@@ -306,8 +317,8 @@ class FieldsInView:
 
         try:
             if kind == "strain_gauge" and group == "Strain":
-                strains = maps.strain_at(self.view.frame, *position)
-                return f": {describe(float(strains[name][0]), float(strains[f'{name}_std'][0]), field.unit)}"
+                strain = maps.strain_at(self.view.frame, *position)[name]
+                return f": {describe(float(strain.values[0]), float(strain.uncertainty[0]), field.unit)}"
             kind, position = ("point", position[:2]) if kind == "strain_gauge" else (kind, position)
             settings = ProbeSettings(measure=cast(Any, maps.physical.measure))
             probe = make_probe(maps.physical.covariance, kind, 1, position, settings, maps.physical.rectified)
@@ -316,10 +327,9 @@ class FieldsInView:
         of_gauge = {"Displacement": "extension", "Strain": "strain"}.get(group) if kind == "gauge" else None
         quantity_name = of_gauge or (name if isinstance(probe, Area) and group == "Strain" else None)
         if quantity_name and maps.since is None and not maps.rigid_removed:
-            displacement = self.displacement[:, None, probe.nodes]
-            nodal = Nodal.of(displacement)
+            displacement = Displacement.stack([self.displacement.isel(node=probe.nodes)])
             probe_histories = (
-                entry for entry in probe.histories(nodal) if entry.name == f"{probe.name}_{quantity_name}"
+                entry for entry in probe.histories(displacement) if entry.name == f"{probe.name}_{quantity_name}"
             )
             for entry in (
                 converted
@@ -344,14 +354,15 @@ class FieldsInView:
         if field.stepped:
             nearest = mean.sum.weights(np.ones(len(mean.nodes), dtype=bool), linear=True)[0][0].argmax()
             return float(values.values[mean.nodes[nearest]]), math.nan
-        is_displacement = name in ("u", "v")
-        nodal = self.displacement["uv".index(name) :: 2] if is_displacement else np.stack([values.values, values.std])
-        of_nodes, stds, *bias = nodal[:, None, mean.nodes]
-        has_std = bool(np.isfinite(stds).any())
-        has_data = np.isfinite(of_nodes + (stds if has_std else 0))
-        weights, _ = mean.weights(has_data, linear=not (is_displacement or field.is_signed))
-        averages = mean.average(weights[:, 0], of_nodes, stds, *bias)
-        (value,), (std,) = self.maps.physical.units.lengths(*averages) if is_displacement else averages
+        components = {component.name: component for component in self.displacement.components}
+        is_displacement = name in components
+        nodal = Field.stack([components.get(name, values).isel(node=mean.nodes)])
+        has_std = bool(np.isfinite(nodal.uncertainty).any())
+        has_data = np.isfinite(nodal.values + (nodal.uncertainty if has_std else 0))
+        weights = mean.weights(has_data, linear=not (is_displacement or field.is_signed))[0][:, 0]
+        average = (mean.average if is_displacement else mean.average_bound)(weights, nodal)
+        average = self.maps.physical.units.convert(average) if is_displacement else average
+        (value,), (std,) = average.values, average.uncertainty
         if is_displacement and name != field.name:
             return float(std), math.nan
         return float(value), float(std) if has_std else math.nan

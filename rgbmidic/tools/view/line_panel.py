@@ -14,8 +14,8 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import ResultError
-from rgbmidic.fields import History
-from rgbmidic.results import Maps, MapValues
+from rgbmidic.fields import Field
+from rgbmidic.results import Maps
 from rgbmidic.results.profiles import Profile
 from rgbmidic.tools.report import profile_figure
 from rgbmidic.tools.report.style import time_axis
@@ -114,7 +114,7 @@ class LinePanel:
     ) -> None:
         self._reading: _LineReading | None = None
         self._request: tuple[Any, ...] = ()
-        self._values: MapValues | None = None
+        self._values: Field | None = None
         self._look: object = None
         self._fields, self._map_colours, self._reader = fields, colours, Background(document)
         self.names: list[str] = []
@@ -142,7 +142,7 @@ class LinePanel:
         self.profile.y_range.renderers = [profile_line]
         self.models = (self.status, self.wave, self.profile)
 
-    def update(self, values: MapValues) -> bool:
+    def update(self, values: Field) -> bool:
         """Show the field, of which the map has `values`, along the line in view; return whether there is one."""
         fields, view = self._fields, self._fields.view
         probes = probe_marks(view.marks).items()
@@ -212,16 +212,15 @@ class LinePanel:
         self.profile.xaxis.axis_label, self.profile.yaxis.axis_label = position, profile.field.label
         self.wave.title.text = f"{profile.field.label} along the line"
 
-    def show_profile(self, values: MapValues | None) -> None:
+    def show_profile(self, values: Field | None) -> None:
         """Show the profile of the frame in view, of which the map has the values; None: it shows nothing."""
         self._values, frame, self.status.visible = values, self._fields.view.frame, bool(self.status.text)
         if self._reading is None or values is None:
             self._line.data, self._bands.data, self.frame_mark.location = columns("x y"), columns("xs ys"), None
             return
         profile = self._reading.profile
-        profile_values, std = profile.line.read(values.values, values.std, profile.covariance_key)
-        self._line.data = {"x": profile.positions, "y": profile_values}
-        curve = History(name=profile.field.name, unit=profile.field.unit, values=profile_values, std=std)
+        curve = profile.line.read(values, profile.covariance_key)
+        self._line.data = {"x": profile.positions, "y": curve.values}
         self._bands.data = dict(zip(("xs", "ys"), uncertainty_band(profile.positions, curve), strict=True))
         time = self._reading.clock[frame]
         self.frame_mark.location, self.profile.title.text = (

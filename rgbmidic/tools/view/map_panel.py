@@ -435,16 +435,17 @@ class MapPanel:
         self._contours.show(contours)
         arrows, title = None, "times their length (0: as there is room)"
         if view.vectors:
-            displacement = fields.displacement[:2].T
+            displacement = fields.displacement.values.T
             if fields.maps.physical.rectified.camera is not None:  # that is on the plane, the arrows are on the image
-                origin = fields.result.nodes if view.since < 0 else fields.maps.read("u", view.since).deformed_nodes
-                displacement = values.deformed_nodes - origin
+                origin = fields.result.nodes if view.since < 0 else fields.maps.deformed_nodes(view.since)
+                displacement = fields.deformed_nodes - origin
             arrows, longer = arrow_lines(window, nodes, displacement, view.longer)
             title = f"{title}: {longer:.3g}"
         self._arrows.show(arrows)
-        missing = np.flatnonzero(values.status) if view.blank else ()
+        status = fields.node_status
+        missing = np.flatnonzero(status) if view.blank else ()
         colours = palette("codes")
-        self._blank.show([(*fields.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
+        self._blank.show([(*fields.result.nodes[node].tolist(), "", colours[status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
         gauge = fields.gauge
         texts = {name: fields.probe_text(marks[0].kind, probe_position(marks, gauge)) for name, marks in probes}
@@ -454,7 +455,7 @@ class MapPanel:
         names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), extremes, strict=False)
         self._extreme_labels.show(
             [
-                (*nodes[node].tolist(), f"{name} {field.format(values.values[node], values.std[node])}", colour)
+                (*nodes[node].tolist(), f"{name} {field.format(values.values[node], values.uncertainty[node])}", colour)
                 for name, colour, node in names
             ],
             other_texts=[(x, y, text) for *_, x, y, text in self.marks.shapes],

@@ -21,7 +21,7 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.results import MapValues, Profile, Result
+from rgbmidic.results import Field, Result
 from rgbmidic.settings import TestSettings
 from rgbmidic.tools.report.style import STATUS_COLOURS, colour_range, ordinary_values, resample, view_limits
 from rgbmidic.tools.view.constants import VIEWER
@@ -260,9 +260,9 @@ def element_at(
     return (elements[containing[0]], shape[containing[0]]) if len(containing) else None
 
 
-def robust_range(field_values: MapValues | Profile) -> tuple[float, float] | None:
+def robust_range(field_values: Field) -> tuple[float, float] | None:
     """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
-    colour_values = ordinary_values(field_values.values, field_values.std)
+    colour_values = ordinary_values(field_values.values, field_values.uncertainty)
     return colour_range(colour_values) if colour_values.size else None
 
 

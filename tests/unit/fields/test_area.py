@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, STD, nodal_noise
 
-from rgbmidic.fields import Nodal, make_probe
+from rgbmidic.fields import Displacement, make_probe
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
 
@@ -18,7 +18,7 @@ def read(kind: str, moved: FloatArray, measure: str = "green-lagrange") -> dict[
     probe = make_probe(COVARIANCE, kind, 1, AREAS[kind], ProbeSettings(measure=measure))
     part, std = moved[:, probe.nodes], np.full((len(moved), len(probe.nodes)), STD)
     std = np.where(np.isfinite(part[..., 0]), std, np.nan)
-    found = probe.histories(Nodal(u=part[..., 0], v=part[..., 1], u_std=std, v_std=std))
+    found = probe.histories(Displacement.in_plane(*np.moveaxis(part, 2, 0), std, std))
     return {history.name.removeprefix(f"{kind}_1_"): (history.values, history.std) for history in found}  # type: ignore[misc]
 
 

@@ -7,7 +7,7 @@ import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation, nodal_noise
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Nodal, NodalCovariance, RigidMotion, make_probe
+from rgbmidic.fields import Displacement, NodalCovariance, RigidMotion, make_probe
 from rgbmidic.mesh import Region, Tri3Mesh
 
 DRAWS = 100
@@ -33,9 +33,9 @@ def test_it_is_that_of_dense_algebra():
         assert np.linalg.eigvalsh(found).min() > 0
 
 
-def nodal(nodes: np.ndarray, motion: np.ndarray) -> Nodal:
+def nodal(nodes: np.ndarray, motion: np.ndarray) -> Displacement:
     std = np.broadcast_to(STD[nodes], (len(motion), len(nodes)))
-    return Nodal(u=motion[:, nodes, 0], v=motion[:, nodes, 1], u_std=std, v_std=std)
+    return Displacement.in_plane(*np.moveaxis(motion[:, nodes], 2, 0), std, std)
 
 
 @pytest.mark.parametrize("kind", PLACES)
@@ -66,15 +66,16 @@ def test_a_rigid_motion_is_found_covered_and_taken_off():
     centre = MESH.nodes.mean(axis=0)
     rigid = (MESH.nodes - centre) @ turn.T + centre + shift - MESH.nodes
     for noise in NOISE:
-        found = RigidMotion.of(COVARIANCE, *(rigid + noise).T, STD, STD)
-        errors.append([(found.rotation - angle) / found.rotation_std, *((found.shift - shift) / found.shift_std)])
+        found = RigidMotion.of(COVARIANCE, Displacement.in_plane(*(rigid + noise).T, STD, STD))
+        turned, moved = found.rotation, found.shift
+        errors.append([(turned.values - angle) / turned.std, *((moved.values - shift) / moved.std)])
     assert (np.abs(np.sqrt(np.mean(np.square(errors), axis=0)) - 1) < 0.2).all()
-    exact = RigidMotion.of(COVARIANCE, *rigid.T, STD, STD)
+    exact = RigidMotion.of(COVARIANCE, Displacement.in_plane(*rigid.T, STD, STD))
     np.testing.assert_allclose(exact.at(MESH.nodes), rigid, atol=1e-9)
     own = np.stack([0.01 * (MESH.nodes[:, 0] - centre[0]), np.zeros(len(STD))])
     moved = (MESH.nodes + own.T - centre) @ turn.T + centre + shift - MESH.nodes
-    left = exact.removed(MESH.nodes, np.stack([*moved.T, STD, STD]))
-    np.testing.assert_allclose(left[:2], own, atol=1e-9)
-    np.testing.assert_allclose(left[2:], [STD, STD])
+    left = exact.removed(MESH.nodes, Displacement.in_plane(*moved.T, STD, STD))
+    np.testing.assert_allclose(left.values, own, atol=1e-9)
+    np.testing.assert_allclose(left.std, [STD, STD])
     with pytest.raises(InputError, match="two measured nodes"):
-        RigidMotion.of(COVARIANCE, *np.full((2, len(STD)), np.nan), STD, STD)
+        RigidMotion.of(COVARIANCE, Displacement.in_plane(*np.full((2, len(STD)), np.nan), STD, STD))

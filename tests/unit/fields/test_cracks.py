@@ -9,7 +9,7 @@ import pytest
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Nodal, NodalCovariance, Units, crack_jump
+from rgbmidic.fields import Displacement, NodalCovariance, Units, crack_jump
 from rgbmidic.tools.finite_elements import Williams, stress_intensity
 from rgbmidic.tools.finite_elements.crack_tip import williams_series
 
@@ -37,7 +37,7 @@ MESH = split([START, TIP])
 def fields(mesh, displacement, std=STD):
     """Displacements (N, 2) or (T, N, 2) as the functions take them."""
     u, v = np.moveaxis(np.atleast_3d(displacement.reshape(-1, len(mesh.nodes), 2)), -1, 0)
-    return Nodal(u=u, v=v, u_std=np.full(u.shape, std), v_std=np.full(u.shape, std))
+    return Displacement.in_plane(u, v, np.full(u.shape, std), np.full(u.shape, std))
 
 
 def textbook(mesh, williams, k1=K1, k2=K2, t=T, tip=TIP, direction=(1.0, 0.0)):
@@ -118,7 +118,7 @@ def test_a_rigid_motion_has_neither_jump_nor_factors():
     assert np.abs(found.factors).max() < 1e-10
     assert np.abs(found.t_stress).max() < 1e-8
     jump = crack_jump(MESH.nodes, MESH.elements, moved, START, TIP)
-    assert np.abs([jump.opening, jump.sliding]).max() < 1e-9
+    assert np.abs([jump.opening.values, jump.sliding.values]).max() < 1e-9
 
 
 def test_the_jump_is_stated_in_the_axes_of_the_deformed_crack():
@@ -129,11 +129,11 @@ def test_the_jump_is_stated_in_the_axes_of_the_deformed_crack():
     for degrees in (0, 40):
         jump = crack_jump(MESH.nodes, MESH.elements, fields(MESH, turned(MESH, field, degrees)), START, TIP)
         inner = slice(1, -1)  # at the last pair the middle line bends to the tip
-        np.testing.assert_allclose(jump.opening[0, inner], 2.0, rtol=1e-9)
-        np.testing.assert_allclose(jump.sliding[0, inner], 0.5, rtol=1e-9)
+        np.testing.assert_allclose(jump.opening.values[0, inner], 2.0, rtol=1e-9)
+        np.testing.assert_allclose(jump.sliding.values[0, inner], 0.5, rtol=1e-9)
     back = crack_jump(MESH.nodes, MESH.elements, fields(MESH, field), TIP, START)
-    np.testing.assert_allclose(back.opening[0, inner], 2.0, rtol=1e-9)
-    np.testing.assert_allclose(back.sliding[0, inner], 0.5, rtol=1e-9)
+    np.testing.assert_allclose(back.opening.values[0, inner], 2.0, rtol=1e-9)
+    np.testing.assert_allclose(back.sliding.values[0, inner], 0.5, rtol=1e-9)
     np.testing.assert_allclose(back.points[::-1], jump.points)
     np.testing.assert_allclose(jump.distance, jump.points[:, 0] - 5, atol=1e-9)
 
@@ -145,7 +145,7 @@ def test_the_stated_uncertainty_is_that_of_draws_of_the_nodes_noise():
     root = np.linalg.cholesky(NodalCovariance.from_mesh(MESH).correlation.toarray())
     noise = STD * (root @ random.normal(size=(draws, *field.shape)))
     jump = crack_jump(MESH.nodes, MESH.elements, fields(MESH, field + noise), START, TIP)
-    for values, std in ((jump.opening, jump.opening_std), (jump.sliding, jump.sliding_std)):
+    for values, std in ((jump.opening.values, jump.opening.std), (jump.sliding.values, jump.sliding.std)):
         ratio = values.std(axis=0) / std.mean(axis=0)
         assert 0.88 < ratio.min() < ratio.max() < 1.12  # 300 draws: a ratio to 4 %, the largest of 60 to 10 %
     opened = textbook(MESH, MATERIAL, 5.0, 2.0) + noise[:60]
@@ -162,7 +162,7 @@ def test_values_and_uncertainty_are_those_of_generalised_least_squares_with_the_
     random, count = np.random.default_rng(5), len(MESH.nodes)
     std = random.uniform(0.5, 2, (2, count)) * STD
     u, v = textbook(MESH, MATERIAL).T + std * random.normal(size=(2, count))
-    nodal = Nodal(u=u[None], v=v[None], u_std=std[:1], v_std=std[1:])
+    nodal = Displacement.in_plane(u[None], v[None], std[:1], std[1:])
     found = stress_intensity(MESH.nodes, MESH.elements, nodal, TIP, RADII, replace(MATERIAL, terms=4))
     x, y = (MESH.nodes - TIP).T
     used = (np.hypot(x, y) >= RADII[0]) & (np.hypot(x, y) <= RADII[1])
@@ -210,7 +210,7 @@ def test_a_branch_and_lost_nodes_leave_the_other_pairs():
     lost = np.zeros(MESH.nodes.shape)
     lost[np.hypot(*(MESH.nodes - (100, 200)).T) < SIZE] = np.nan
     jump = crack_jump(MESH.nodes, MESH.elements, fields(MESH, lost), START, TIP)
-    gone = np.isnan(jump.opening[0])
+    gone = np.isnan(jump.opening.values[0])
     assert 3 <= gone.sum() <= 6
     assert np.abs(jump.points[gone, 0] - 100).max() < 2.5 * SIZE
 

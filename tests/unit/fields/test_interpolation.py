@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation
 
-from rgbmidic.fields import MeshPoints, Nodal, ProfileLine, StrainGauges, at_pixels, make_probe
+from rgbmidic.fields import Displacement, Field, MeshPoints, ProfileLine, StrainGauges, at_pixels, make_probe
 from rgbmidic.fields.interpolation import PointSum
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.recovery import at_free_boundary, quadratic_fit
@@ -86,11 +86,12 @@ def test_point_pixel_profile_sum_and_weights_are_one_field() -> None:
     columns, rows = np.round(POINTS).astype(int).T
     np.testing.assert_allclose(pixels[:, rows, columns].T, read, atol=1e-5)
     line = ProfileLine(COVARIANCE, StrainGauges.at_nodes(COVARIANCE), 33, 40, 190, 120)
-    along, spread = line.read(values[:, 0], np.full(len(values), 0.01))
+    read = line.read(Field(name="u", dims=("node",), values=values[:, 0], std=np.full(len(values), 0.01)))
+    along, spread = read.values, read.uncertainty
     np.testing.assert_allclose(along, MeshPoints.of(MESH, line.points).read(values[:, 0]), atol=1e-12)
     probe = make_probe(COVARIANCE, "point", 1, line.points[5])
     u, v = values[None, probe.nodes].transpose(2, 0, 1)
-    point = probe.histories(Nodal(u=u, v=v, u_std=np.full(u.shape, 0.01), v_std=np.full(u.shape, 0.01)))[0]
+    point = probe.histories(Displacement.in_plane(u, v, np.full(u.shape, 0.01), np.full(u.shape, 0.01)))[0]
     assert point.values[0] == pytest.approx(along[5], abs=1e-12)
     assert point.std is not None
     assert point.std[0] == pytest.approx(spread[5], rel=1e-6)

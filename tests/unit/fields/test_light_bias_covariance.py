@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, nodal_noise
 
-from rgbmidic.fields import Nodal, NodalCovariance, RigidMotion, StrainGauges, make_probe
+from rgbmidic.fields import Displacement, NodalCovariance, RigidMotion, StrainGauges, make_probe
 from rgbmidic.mesh import Region, Tri3Mesh
 
 RANGE, DRAWS = 34.0, 300
@@ -52,7 +52,7 @@ def test_its_correlation_is_that_of_its_distance_in_px_of_the_image() -> None:
 def test_every_probe_is_covered(kind: str) -> None:
     """300 draws: rms of error over stated within 3 standard deviations of 1."""
     probe = make_probe(COVARIANCE, kind, 1, PLACES[kind])
-    for history in probe.histories(Nodal.of(FIELDS[..., probe.nodes])):
+    for history in probe.histories(Displacement.in_plane(*FIELDS[..., probe.nodes])):
         if history.name.endswith(("_u", "_v", "extension", "exx", "eyy", "exy")):
             assert history.std is not None
             assert abs(np.sqrt(np.mean((history.values / history.std) ** 2)) - 1) < 0.13, history.name
@@ -63,8 +63,8 @@ def test_a_mean_in_glare_is_less_certain() -> None:
     probe = make_probe(COVARIANCE, "region", 1, (40, 40, 120, 130))
     exact = COVARIANCE.correlation.toarray() * np.outer(FIT, FIT) + correlation(MESH.nodes) * np.outer(BIAS, BIAS)
     part = exact[np.ix_(probe.nodes, probe.nodes)]
-    mean, *_ = probe.histories(Nodal.of(FIELDS[:, :1, probe.nodes]))
-    plain, *_ = probe.histories(Nodal.of(FIELDS[:4, :1, probe.nodes]))
+    mean, *_ = probe.histories(Displacement.in_plane(*FIELDS[:, :1, probe.nodes]))
+    plain, *_ = probe.histories(Displacement.in_plane(*FIELDS[:4, :1, probe.nodes]))
     covariance = COVARIANCE.subset(probe.nodes)
     factor = covariance.factor(STD[probe.nodes], BIAS[probe.nodes])
     np.testing.assert_allclose((factor @ factor.T).toarray(), part, atol=1e-2 * BIAS.max() ** 2)
@@ -74,8 +74,8 @@ def test_a_mean_in_glare_is_less_certain() -> None:
 def test_gauges_at_nodes_have_it_as_it_is_and_that_of_the_fit_by_its_inflation() -> None:
     gauges = StrainGauges.at_nodes(COVARIANCE, 80)
     still = np.zeros(len(STD))
-    _, found = gauges.gradient(still, still, STD, STD, BIAS, BIAS)
-    _, fit = gauges.gradient(still, still, FIT, FIT)
+    _, found = gauges.gradient(Displacement.in_plane(still, still, STD, STD, BIAS, BIAS))
+    _, fit = gauges.gradient(Displacement.in_plane(still, still, FIT, FIT))
     dense = correlation(MESH.nodes) * np.outer(BIAS, BIAS)
     x, y = (slope.toarray() for slope in gauges.slopes)
     for (row, column), (a, b) in {(0, 0): (x, x), (0, 1): (x, y), (1, 1): (y, y), (3, 3): (y, y)}.items():
@@ -83,13 +83,13 @@ def test_gauges_at_nodes_have_it_as_it_is_and_that_of_the_fit_by_its_inflation()
         scale = np.sqrt(np.einsum("gn,nm,gm->g", a, dense, a) * np.einsum("gn,nm,gm->g", b, dense, b)).max()
         np.testing.assert_allclose((found - fit)[:, row, column], exact, atol=0.03 * scale)
     missing = np.where(np.arange(len(STD)) == 40, np.nan, 0.0)
-    _, beside = gauges.gradient(missing, still, STD, STD, BIAS, BIAS)
+    _, beside = gauges.gradient(Displacement.in_plane(missing, still, STD, STD, BIAS, BIAS))
     assert np.isfinite(beside).all(axis=(1, 2)).sum() == len(STD) - MESH.adjacent_nodes(np.isnan(missing)).sum()
 
 
 def test_a_rigid_motion_is_covered() -> None:
-    found = [RigidMotion.of(COVARIANCE, *fields) for fields in FIELDS.swapaxes(0, 1)]
-    ratios = [[one.rotation / one.rotation_std, *(one.shift / one.shift_std)] for one in found]
+    found = [RigidMotion.of(COVARIANCE, Displacement.in_plane(*fields)) for fields in FIELDS.swapaxes(0, 1)]
+    ratios = [[one.rotation.values / one.rotation.std, *(one.shift.values / one.shift.std)] for one in found]
     assert (np.abs(np.sqrt(np.mean(np.square(ratios), axis=0)) - 1) < 0.13).all()
-    removed = found[0].removed(MESH.nodes, FIELDS[:, 0])
-    np.testing.assert_allclose(removed[2:], FIELDS[2:, 0], atol=1e-9)
+    removed = found[0].removed(MESH.nodes, Displacement.in_plane(*FIELDS[:, 0]))
+    np.testing.assert_allclose([*removed.std, *removed.bias], FIELDS[2:, 0], atol=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import NodalCovariance, ProfileLine, StrainGauges
+from rgbmidic.fields import Displacement, Field, NodalCovariance, ProfileLine, StrainGauges
 from rgbmidic.fields.profiles import arrival_times, fit_front, rate_correlation
 from rgbmidic.mesh import Region, Tri3Mesh
 
@@ -29,31 +29,35 @@ def wave(noise: float, seed: int) -> np.ndarray:
     return pulse + errors[1:] - errors[0]
 
 
+def nodal(values: np.ndarray, std: np.ndarray) -> Field:
+    return Field(name="u", dims=("node",), values=values, std=std)
+
+
 def along(field: str, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The field u or exx and its uncertainty along the line, (T, P)."""
     std, nothing, read = np.full(len(MESH.nodes), noise * np.sqrt(2)), np.zeros(len(MESH.nodes)), []
     for u in wave(noise, seed):
         if field == "u":
-            read.append(LINE.read(u, std))
+            read.append(LINE.read(nodal(u, std)))
         else:
-            strain = GAUGES.strain(u, nothing, std, std, measure="engineering")
-            read.append(LINE.read(strain.components[:, 0], strain.components_std[:, 0], "exx"))
-    return np.array([pair[0] for pair in read]), np.array([pair[1] for pair in read])
+            strain = GAUGES.strain(Displacement.in_plane(u, nothing, std, std), "engineering")
+            read.append(LINE.read(strain["exx"], "exx"))
+    return np.array([one.values for one in read]), np.array([one.std for one in read])
 
 
 def test_a_quadratic_field_is_read_exactly() -> None:
     x, y = MESH.nodes.T
-    values, std = LINE.read(1e-4 * x**2 - 2e-4 * x * y + y, np.full(len(x), 0.01))
+    read = LINE.read(nodal(1e-4 * x**2 - 2e-4 * x * y + y, np.full(len(x), 0.01)))
     x, y = LINE.points.T
-    np.testing.assert_allclose(values, 1e-4 * x**2 - 2e-4 * x * y + y, atol=1e-6)
-    assert np.all((std > 0) & (std < 0.012))
+    np.testing.assert_allclose(read.values, 1e-4 * x**2 - 2e-4 * x * y + y, atol=1e-6)
+    assert np.all((read.uncertainty > 0) & (read.uncertainty < 0.012))
 
 
 def test_the_stated_uncertainty_is_that_of_noise() -> None:
     random = np.random.default_rng(1)
-    draws = np.array([LINE.read(ROOT @ random.normal(0, 0.01, len(MESH.nodes)), np.full(len(MESH.nodes), 0.01))
-                      for _ in range(300)])  # fmt: skip
-    ratio = draws[:, 0].std(axis=0) / draws[0, 1]
+    std = np.full(len(MESH.nodes), 0.01)
+    draws = [LINE.read(nodal(ROOT @ random.normal(0, 0.01, len(std)), std)) for _ in range(300)]
+    ratio = np.std([draw.values for draw in draws], axis=0) / draws[0].uncertainty
     assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1
 
 
@@ -61,7 +65,8 @@ def test_a_point_beside_a_missing_node_is_not_measured() -> None:
     values = np.zeros(len(MESH.nodes))
     near = np.hypot(*(MESH.nodes - (250, 50)).T).argmin()
     values[near] = np.nan
-    read, std = LINE.read(values, np.full(len(values), 0.01))
+    field = LINE.read(nodal(values, np.full(len(values), 0.01)))
+    read, std = field.values, field.uncertainty
     away = np.abs(LINE.points[:, 0] - MESH.nodes[near, 0])
     assert np.isnan(read[away < 5]).all()
     assert np.isfinite(read[away > 25]).all()

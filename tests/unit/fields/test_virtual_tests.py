@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, NodalTest
 
-from rgbmidic.fields import Nodal, StrainGauges, make_probe, rates, reference_fraction
+from rgbmidic.fields import Displacement, Field, StrainGauges, make_probe, rates, reference_fraction
 from rgbmidic.typing import FloatArray
 
 RIGHT, RATES = (0.9, 1.1), (0.7, 1.2)
@@ -55,12 +55,13 @@ def ratios(
 
 def nodal_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
     """Displacement, velocity and acceleration at the nodes."""
+    options = {"common_fraction": SHARE, "references": test.references}
     std = np.repeat(test.std[..., None], 2, axis=2)
-    found = rates(test.times, measured, std, window=window, common_fraction=SHARE, references=test.references)
+    found = rates(test.times, Field(name="u", values=measured, std=std), window=window, **options)
     velocity, acceleration = true_rates(test)
     yield "displacement", (measured - test.truth)[1:] / std[1:]
-    yield "velocity", (found.velocity - velocity) / found.velocity_std
-    yield "acceleration", (found.acceleration - acceleration) / found.acceleration_std
+    yield "velocity", (found["velocity"].values - velocity) / found["velocity"].std
+    yield "acceleration", (found["acceleration"].values - acceleration) / found["acceleration"].std
 
 
 def true_rates(test: NodalTest) -> tuple[FloatArray, FloatArray]:
@@ -77,15 +78,15 @@ def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Itera
     probe = make_probe(COVARIANCE, "strain_gauge", 1, (110, 90, 80))
     std = test.std[:, probe.nodes]
     read = [
-        probe.histories(Nodal(u=f[:, probe.nodes, 0], v=f[:, probe.nodes, 1], u_std=std, v_std=std))
+        probe.histories(Displacement.in_plane(*np.moveaxis(f[:, probe.nodes], 2, 0), std, std))
         for f in (measured, test.truth)
     ]
     found, true = (np.stack([history.values for history in histories[:3]], axis=1) for histories in read)
     spread = np.stack([history.std for history in read[0][:3]], axis=1)
     yield "strain", (found - true)[1:] / spread[1:]
     options = {"window": window, "common_fraction": SHARE, "references": test.references}
-    rate, exact = (rates(test.times, one, spread, **options) for one in (found, true))
-    yield "strain rate", (rate.velocity - exact.velocity) / rate.velocity_std
+    rate, exact = (rates(test.times, Field(name="strain", values=one, std=spread), **options) for one in (found, true))
+    yield "strain rate", (rate["velocity"].values - exact["velocity"].values) / rate["velocity"].std
 
 
 @pytest.mark.parametrize("name", TESTS)
@@ -101,17 +102,22 @@ def test_every_quantity_is_as_far_off_as_it_says(name, errors, draws):
 def test_rates_without_noise_are_those_of_the_motion(name):
     """What the polynomial cannot follow is less than its uncertainty in noise."""
     test, window = TESTS[name]
+    options = {"common_fraction": SHARE, "references": test.references}
     std = np.repeat(test.std[..., None], 2, axis=2)
-    found = rates(test.times, test.truth, std, window=window, common_fraction=SHARE, references=test.references)
+    found = rates(test.times, Field(name="u", values=test.truth, std=std), window=window, **options)
     velocity, acceleration = true_rates(test)
     inner = (test.times > test.times[0] + window / 2) & (test.times < test.times[-1] - window / 2)
-    assert np.abs(found.velocity - velocity)[inner].max() < np.median(found.velocity_std)
-    assert np.abs(found.acceleration - acceleration)[inner].max() < np.median(found.acceleration_std)
+    assert np.abs(found["velocity"].values - velocity)[inner].max() < np.median(found["velocity"].std)
+    assert np.abs(found["acceleration"].values - acceleration)[inner].max() < np.median(found["acceleration"].std)
 
 
 def test_the_strain_of_the_tensile_test_is_the_closed_form_at_every_node():
     gauges = StrainGauges.at_nodes(COVARIANCE, 60)
     for field, std, time in zip(TENSION.truth, TENSION.std, TENSION.times, strict=True):
-        strain = gauges.strain(*field.T, std, std, measure="hencky")
+        strain = gauges.strain(Displacement.in_plane(*field.T, std, std), "hencky")
         np.testing.assert_allclose(strain.components, [[-0.8 * time, 2 * time, 0]] * len(std), atol=1e-12)
-        np.testing.assert_allclose(strain.principal, [[2 * time, -0.8 * time]] * len(std), atol=1e-12)
+        np.testing.assert_allclose(
+            np.stack([strain["e1"].values, strain["e2"].values], axis=1),
+            [[2 * time, -0.8 * time]] * len(std),
+            atol=1e-12,
+        )

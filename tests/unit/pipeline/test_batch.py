@@ -10,7 +10,7 @@ import pytest
 from small_tests import SmallTest, colour_test
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.fields import History, Units
+from rgbmidic.fields import Field, Units
 from rgbmidic.pipeline.batch import (
     Outcome,
     check_summary,
@@ -72,8 +72,8 @@ def test_a_modulus_is_the_slope_while_the_stress_rises() -> None:
     for _ in range(100):
         shared, own = random.normal(0, 2e-5), random.normal(0, 2e-5, 80)
         columns = (
-            History(name="gauge_1_strain", unit="", values=strain + own + shared, std=np.full(80, 2e-5 * 2**0.5)),
-            History(name="stress", unit="MPa", values=stress, std=None),
+            Field(name="gauge_1_strain", unit="", values=strain + own + shared, std=np.full(80, 2e-5 * 2**0.5)),
+            Field(name="stress", unit="MPa", values=stress, std=None),
         )
         index = np.arange(80)
         histories = Histories(frames=index, numbers=index, status=0 * index, times=None, quantities=columns,

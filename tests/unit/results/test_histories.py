@@ -18,7 +18,7 @@ from results import MESH, NODES, make_origin, make_result
 from rgbmidic.cli import app as cli
 from rgbmidic.cli.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.fields import History, Units
+from rgbmidic.fields import Field, Units
 from rgbmidic.fields.history import rate_words
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -291,7 +291,7 @@ def test_a_channel_file_that_is_none_is_one_line(tmp_path: Path, text: str, word
         Channels.read(tmp_path / "c.csv")
 
 
-def histories_of(times: np.ndarray, *quantities: History) -> Histories:
+def histories_of(times: np.ndarray, *quantities: Field) -> Histories:
     """Histories of frames that are all there."""
     numbers = np.arange(len(times))
     return Histories(
@@ -308,7 +308,7 @@ def histories_of(times: np.ndarray, *quantities: History) -> Histories:
 
 def test_a_channel_does_not_take_the_place_of_a_measured_column(tmp_path: Path) -> None:
     times = np.arange(4.0)
-    gauge = History(name="gauge_1_strain", unit="", values=np.full(4, 1e-3), std=np.full(4, 1e-5))
+    gauge = Field(name="gauge_1_strain", unit="", values=np.full(4, 1e-3), std=np.full(4, 1e-5))
     for name in ("gauge_1_strain", "frame", "status"):
         (tmp_path / "c.csv").write_text(f"time_s,{name}\n" + "".join(f"{t},{t}\n" for t in times))
         with pytest.raises(InputError, match=f"have the names of columns of the history, rename: {name}"):
@@ -317,7 +317,7 @@ def test_a_channel_does_not_take_the_place_of_a_measured_column(tmp_path: Path) 
 
 def test_doubts_about_the_clock_of_a_channel_file_are_stated(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     times = np.arange(4.0)
-    gauge = History(name="gauge_1_strain", unit="", values=np.zeros(4), std=np.zeros(4))
+    gauge = Field(name="gauge_1_strain", unit="", values=np.zeros(4), std=np.zeros(4))
     (tmp_path / "c.csv").write_text("time_s,a\n" + "".join(f"{1000 * t},{t}\n" for t in times))
     found = with_channels(histories_of(times, gauge), ChannelSettings(file=tmp_path / "c.csv"))
     assert any("the clocks of channels and frames are taken as equal" in remark for remark in found.remarks)
@@ -611,13 +611,13 @@ def test_what_is_cut_off_a_probe_is_stated(result: Result) -> None:
 
 
 def test_of_many_channels_the_first_are_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    columns = [History(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
+    columns = [Field(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
     assert len(history_figure(histories_of(np.arange(4.0), *columns)).axes) == 24
     assert "the picture shows 24 of 40 kinds" in caplog.text
 
 
 def test_a_legend_states_how_many_it_does_not_name() -> None:
-    curves = [History(name=f"point_{i}_u", unit="px", values=np.arange(4.0) + i, std=np.ones(4)) for i in range(48)]
+    curves = [Field(name=f"point_{i}_u", unit="px", values=np.arange(4.0) + i, std=np.ones(4)) for i in range(48)]
     legend = history_figure(histories_of(np.arange(4.0), *curves)).axes[0].get_legend()
     names = [text.get_text() for text in legend.get_texts()]
     assert len(names) == 13
@@ -639,7 +639,7 @@ def test_without_a_file_the_table_is_printed_and_nothing_written(
 def test_extremes_are_not_stated_finer_than_the_test_is_known():
     """A reference frame compared with itself is known to rounding; beside frames known to 1e-4 that means nothing."""
     std = np.array([1.6e-9, 1.1e-4, 1.2e-4])
-    quantity = History(name="point_1_u", unit="mm", values=np.array([2.35e-9, 3e-4, 0.01944]), std=std)
+    quantity = Field(name="point_1_u", unit="mm", values=np.array([2.35e-9, 3e-4, 0.01944]), std=std)
     assert history_rows(histories_of(np.arange(float(len(quantity.values))), quantity))[1] == [
         ["point_1_u", "mm", "0.00000", "0.01944", "0.01944", "0.00011", "3"]
     ]
@@ -649,7 +649,7 @@ def test_extremes_are_not_stated_finer_than_the_test_is_known():
 
 def test_a_direction_that_is_not_drawn_sets_no_limits():
     values, std = np.array([-80.0, 67.0, 68.0, 72.0]), np.array([30.0, 0.4, 0.3, 0.1])
-    quantity = History(name="region_1_direction", unit="deg", values=values, std=std)
+    quantity = Field(name="region_1_direction", unit="deg", values=values, std=std)
     low, high = history_figure(histories_of(np.arange(float(len(quantity.values))), quantity)).axes[0].get_ylim()
     assert 60 < low < 67
     assert 72 < high < 80

@@ -22,8 +22,8 @@ from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, rand
 
 from rgbmidic import CameraCalibration
 from rgbmidic.errors import FrameError
-from rgbmidic.fields import MEASURES
-from rgbmidic.results import QUANTITIES, FrameRecord, Maps, MapValues, Result, ResultStore
+from rgbmidic.fields import MEASURES, Field
+from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.text import format_value, format_with_std
@@ -217,7 +217,7 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     read, record = fields.read("u", 3), result.frame(3)
     np.testing.assert_allclose(read.values, 0.5 * record.u)
     np.testing.assert_allclose(read.std, np.hypot(0.5 * record.u_std, 0.01 * record.u))
-    np.testing.assert_allclose(read.deformed_nodes, result.nodes + np.stack([record.u, record.v], axis=1))
+    np.testing.assert_allclose(fields.deformed_nodes(3), result.nodes + np.stack([record.u, record.v], axis=1))
     np.testing.assert_allclose(fields.read("magnitude", 3).values, 0.5 * np.hypot(record.u, record.v))
     bias = np.where(np.isfinite(record.u_std), 0.5 * np.nan_to_num(record.u_bias_std), np.nan)
     for found in (fields.read("u_bias_std", 3).values, fields.physical.frame(3)["u_bias_std"]):
@@ -397,10 +397,7 @@ def test_a_strain_gauge_at_a_node_is_the_map_at_that_node_since_any_frame(tmp_pa
 
 
 def map_values(values, std):
-    count = len(values)
-    return MapValues(
-        values=values, std=std, deformed_nodes=np.zeros((count, 2)), status=np.zeros(count, dtype=np.uint8)
-    )
+    return Field(name="u", dims=("node",), values=values, std=std)
 
 
 def test_the_magnitude_is_as_uncertain_as_along_itself(tmp_path):
@@ -497,9 +494,7 @@ def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_
 
 
 def test_the_band_is_open_where_a_frame_is_missing():
-    from rgbmidic.fields import History
-
-    told = History(name="a", unit="", values=np.array([1.0, 2, np.nan, 4, 5, 6]), std=np.full(6, 0.5))
+    told = Field(name="a", unit="", values=np.array([1.0, 2, np.nan, 4, 5, 6]), std=np.full(6, 0.5))
     xs, ys = curves.uncertainty_band(np.arange(6.0), told)
     assert [list(x) for x in xs] == [[0, 1, 1, 0], [3, 4, 5, 5, 4, 3]]
     assert list(ys[0]) == [0, 1, 3, 2]

@@ -90,6 +90,7 @@ class ResultQuantity:
             name=f"{self.name}_std",
             source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
             description=f"standard uncertainty of {self.name}",
+            dtype=np.float32,
             symbol=self.symbol and f"σ({self.symbol})",
             group="Uncertainty",
             kind="positive",
