@@ -8,11 +8,11 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -415,6 +415,11 @@ class ResultInUnits(Portable):
         if len(error) > 1:
             return np.asarray(np.fmax.reduce(error / std))
         return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
+
+    @property
+    def exporter(self) -> Callable[[str, BinaryIO], None] | None:
+        """Function that writes the result for other programs into a file; None: those of `rgbmidic.results.export`."""
+        return None
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""

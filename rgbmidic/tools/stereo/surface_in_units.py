@@ -6,10 +6,10 @@ space.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, BinaryIO, ClassVar, Self
 
 import numpy as np
 
@@ -122,13 +122,11 @@ class SurfaceInUnits(ResultInUnits):
         # px are of the frames here: no length on the surface, which readers turn them into
         space = [replace(QUANTITIES[name], symbol=name, kind=kind) for name, kind in _SPACE.items()]
         errors = [QUANTITIES[f"{name}_std"] for name in _SPACE]
-        space, errors = (
-            [replace(one, unit=one.unit.replace("px", "pixel")) for one in part] for part in (space, errors)
-        )
+        space = [replace(entry, unit=entry.unit.replace("px", "pixel")) for entry in (*space, *errors)]
         left = stored_map_quantities(self.result.lights, with_error=False)
         left = [entry for entry in left if not entry.name.startswith(("u_", "v_", "nodal_"))]
         entries = [*(derived[name].with_units(self.units) for name in self.components), *STRAIN.values()]
-        return {entry.name: entry for entry in (*entries, *space, *left, *errors)}
+        return {entry.name: entry for entry in (*entries, *left, *space)}
 
     def displacement(self, frame: int) -> Displacement:
         """Read the displacement of all nodes in a frame, mm, without the part of the calibration in its uncertainty."""
@@ -164,9 +162,14 @@ class SurfaceInUnits(ResultInUnits):
         record, displacement = self.result.frame(index).values, self.displacement(index)
         columns = {name: np.asarray(record[name]) for name in ("number", "status", "node_status", "misfit")}
         fields = [self.field(name, index) for name in self.components]
-        for field in (*fields, *self._strain(displacement).values()):
+        for field in (*fields, *self.gauges.strain(displacement, self.measure).values()):
             columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
         return columns
+
+    @property
+    def exporter(self) -> Callable[[str, BinaryIO], None]:
+        """The file of the result has all that is exported."""
+        return self.result.stereo.export
 
     def calibration_std(self, vector: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Compute the standard uncertainty that the calibration leaves in a displacement or its rate.
