@@ -331,6 +331,9 @@ class FieldSource(Protocol):
     def components(self) -> tuple[str, ...]:
         """Names of the components of the displacement."""
 
+    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
+        """Add to the uncertainty of what probes measure what a calibration leaves, where `units` does not."""
+
     @property
     def covariance(self) -> NodalCovariance:
         """Correlation of the nodes' errors."""

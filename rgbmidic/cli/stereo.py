@@ -46,11 +46,10 @@ def stereo(
     resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
     frames: Annotated[str, Option(help="Only these, such as 1000:2000; when all are measured: --resume.")] = "",
     workers: Workers = 0,
-    csv: Annotated[bool, Option("--csv", help="Write DIR/stereo.csv.")] = False,
     draw: Draw = False,
 ) -> None:
     """Measure shape, motion and surface strain in three dimensions with two cameras."""
-    from rgbmidic.results import Maps, export_result
+    from rgbmidic.results import Maps
     from rgbmidic.settings import read_range
     from rgbmidic.tools.stereo import LeftResult, StereoSettings, measure_stereo, measure_stereo_part
 
@@ -85,8 +84,6 @@ def stereo(
     except KeyboardInterrupt:
         note("what was finished is kept: run the same command again with --resume")
         raise
-    if csv:
-        export_result(LeftResult.of(result), "csv", out / "stereo.csv", overwrite=overwrite or resume)
     if draw:
         from rgbmidic.tools.report import write_maps
 

@@ -474,6 +474,8 @@ def make_probe(
     """
     (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
+    if covariance.surface is not None and kind in ("crack", "tip"):
+        raise InputError(f"{name}: cracks are measured in a plane, not on a surface in space: take one camera's result")
     if len(coordinates) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(coordinates)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}

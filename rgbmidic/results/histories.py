@@ -234,6 +234,7 @@ def read_histories(
     quantities = tuple(
         quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
     )
+    quantities = tuple(source.with_calibration(quantities))
     remarks = [*source.remarks, *_remarks(source, base, speed, by_probe)]
     if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")

@@ -24,7 +24,7 @@ from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, st
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, map_quantities
+from rgbmidic.results.quantities import UNKNOWN_TIME, UV, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ProbeSettings, ScaleSettings
@@ -199,7 +199,8 @@ class Maps(Portable):
         elif field.group == "Strain":
             phrases = [self.physical.strain_description(base), since]
         elif field.group == "Rates" and len(self._measured_frames) >= FEWEST:
-            strain = "" if DERIVED[base].unit else self.physical.strain_description(base)
+            is_strain = not {*field.base_quantities} <= {*self.physical.components}
+            strain = self.physical.strain_description(base) if is_strain else ""
             phrases = [strain, rate_words(self.window, len(self._measured_frames))]
         return ", ".join(filter(None, phrases))
 
@@ -260,21 +261,25 @@ class Maps(Portable):
 
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
         """Compute a displacement or a rate in the reader's units."""
+        source, names, covariance = self._current, entry.base_quantities, None
+        is_vector = {*names} <= {*source.components}
         if entry.order:
-            components = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
+            needed = source.components if source.is_calibrated and is_vector else names
+            by_name = {name: self._rates(name, frame, entry.order) for name in needed}
         else:
-            by_name = {component.name: component for component in self.displacement(frame).components}
-            components = [by_name[name] for name in entry.base_quantities]
-        field = components[0]
-        if len(components) > 1:
+            displacement = self.displacement(frame)
+            by_name, covariance = {one.name: one for one in displacement.components}, displacement.covariance
+        field = by_name[names[0]]
+        if len(names) > 1:
             vector, error = (
-                np.stack(terms, axis=1) for terms in zip(*((c.values, c.uncertainty) for c in components), strict=True)
+                np.stack(arrays, axis=1)
+                for arrays in zip(*((by_name[name].values, by_name[name].uncertainty) for name in names), strict=True)
             )
-            covariance = error[:, :, None] ** 2 * np.eye(len(components))
-            if not entry.order and (stated := self.displacement(frame).covariance) is not None:
-                covariance = np.moveaxis(stated, 2, 0)
-            length, std = length_of(vector, covariance)
+            matrix = error[:, :, None] ** 2 * np.eye(len(names))
+            length, std = length_of(vector, matrix if covariance is None else np.moveaxis(covariance, 2, 0))
             field = replace(field, values=length, std=std, bias=None)
+        if is_vector:
+            field = source.calibrated(field, by_name, names)
         return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
 
     def displacement(self, frame: int) -> Displacement:

@@ -6,7 +6,8 @@ space.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, BinaryIO, ClassVar, Self
@@ -36,6 +37,8 @@ _SPACE = {
     "epipolar_change": "displacement",
 }
 """Quantities of the file, with their standard uncertainty, that maps show as they are, with their kinds."""
+_COMPONENT = re.compile(r"(.+_)([uvw])((?:_velocity|_acceleration)?(?:_before|_after)?)")
+"""Name of a component of a vector that a probe measures: probe, component, rate."""
 _ROUNDING = 1e-6
 """Part of a variance that is left at least where the calibration's is taken off it: single precision (derived)."""
 
@@ -51,6 +54,7 @@ class SurfaceInUnits(ResultInUnits):
     """
 
     result: LeftResult
+    is_calibrated: ClassVar[bool] = True
     components: ClassVar[tuple[str, ...]] = ("u", "v", "w")
 
     @classmethod
@@ -151,10 +155,8 @@ class SurfaceInUnits(ResultInUnits):
             std = arrays[1] if name == base else None
             return Field(name=name, unit=entry.unit, dims=("node",), values=arrays[0], std=std)
         if name in self.components:
-            displacement = self.displacement(frame)
-            component = displacement.components[self.components.index(name)]
-            common = self.calibration_std(dict(zip(self.components, displacement.values, strict=True)))[name]
-            return replace(component, std=np.hypot(component.uncertainty, common))
+            by_name = {one.name: one for one in self.displacement(frame).components}
+            return self.calibrated(by_name[name], by_name, (name,))
         return super().field(name, frame)
 
     def frame(self, index: int) -> dict[str, AnyArray]:
@@ -171,21 +173,55 @@ class SurfaceInUnits(ResultInUnits):
         """The file of the result has all that is exported."""
         return self.result.stereo.export
 
-    def calibration_std(self, vector: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Compute the standard uncertainty that the calibration leaves in a displacement or its rate.
+    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
+        """Add what the calibration leaves in a displacement or its rate, all places of which have it in common.
 
         Parameters
         ----------
+        field
+            Component, or length, of a vector.
         vector
-            u, v and w of the shape (...).
+            All components of the vector, by name, of the same shape.
+        names
+            Components that the field is the length of.
 
         Returns
         -------
-        dict of str to ndarray, shape (...)
+        Field
         """
-        values = np.stack([vector[name] for name in self.components], axis=-1)
-        errors = np.einsum("ijk,...j->i...k", self._gain, values)
-        return dict(zip(self.components, np.linalg.norm(errors, axis=-1), strict=True))
+        values = np.stack([vector[name].values for name in self.components])
+        weights = np.zeros_like(values)
+        for row in map(self.components.index, names):
+            weights[row] = 1.0 if len(names) == 1 else values[row] / np.maximum(field.values, np.finfo(float).tiny)
+        common = np.linalg.norm(np.einsum("ijk,i...,j...->k...", self._gain, weights, values), axis=0)
+        bias = None if field.bias is None else np.hypot(field.bias, common)
+        return replace(field, std=np.hypot(field.uncertainty, common), bias=bias)
+
+    def with_calibration(self, histories: Sequence[Field]) -> tuple[Field, ...]:
+        """Add what the calibration leaves in what probes measure.
+
+        Parameters
+        ----------
+        histories
+            Of all probes.
+
+        Returns
+        -------
+        tuple of Field
+        """
+        by_name = {history.name: history for history in histories}
+        return tuple(self._with_calibration(history, by_name) for history in histories)
+
+    def _with_calibration(self, history: Field, by_name: Mapping[str, Field]) -> Field:
+        if (match := _COMPONENT.fullmatch(history.name)) is not None:
+            vector = {name: by_name.get(f"{match[1]}{name}{match[3]}") for name in self.components}
+            known = {name: field for name, field in vector.items() if field is not None}
+            if len(known) == len(vector):
+                return self.calibrated(history, known, (match[2],))
+        if not history.unit.startswith("mm"):
+            return history
+        relative = float(self.result.stereo.attributes["relative_length_std"])
+        return replace(history, std=np.hypot(history.uncertainty, relative * history.values))
 
     @property
     def _gain(self) -> FloatArray:
