@@ -169,7 +169,7 @@ def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray,
     grid = np.stack(np.meshgrid(np.arange(50.0, 360, 30), [65.0, 100.0, 135.0]), axis=-1).reshape(-1, 2)
     grid = grid[np.hypot(*(grid - HOLE).T) > RADIUS + length / 2 + 4]
     gauges = [make_probe(physical.covariance, "strain_gauge", 1, (x, y, length)) for x, y in grid]
-    fields = Displacement.stack([physical.displacement(frame) for frame in range(FRAMES)])
+    fields = Displacement.concatenate([physical.displacement(frame) for frame in range(FRAMES)])
     exact = [Displacement.in_plane(*np.moveaxis(part, -1, 0), *np.full((2, *part.shape[:2]), STEP)) for part in truth]
     series = [[gauge.histories(part.isel(node=gauge.nodes))[0] for gauge in gauges] for part in (fields, *exact)]
     found, *true = (np.stack([one.values for one in row], axis=1) for row in series)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.fields import rates
+from rgbmidic.fields import Field, rates
 from rgbmidic.typing import BoolArray, FloatArray
 
 from .tables import table
@@ -143,7 +143,9 @@ def judge(signal: Signal, noise: float, draws: int, seed: int, stated: float | N
     own = np.where(known[:, None], values, np.nan)
     still: BoolArray = np.zeros(len(signal.times), dtype=bool)
     std = np.full(own.shape, stated or noise)
-    found = rates(signal.times, own, std, window=WINDOW - 1.0, common_fraction=0.0, references=still)
+    found = rates(
+        signal.times, Field(name="u", values=own, std=std), window=WINDOW - 1.0, common_fraction=0.0, references=still
+    )
     plain = fixed(signal.times, values, known)
     at_rest = signal.times <= (np.inf if signal.onset is None else signal.onset)
     if not (signal.velocity[at_rest] == 0).all():
@@ -155,13 +157,13 @@ def judge(signal: Signal, noise: float, draws: int, seed: int, stated: float | N
         inner[signal.kink] = False
     quiet, beside, verdicts = away & inner, at_rest & ~away & inner, []
     for order, name in enumerate(("velocity", "acceleration")):
-        error = getattr(found, name) - getattr(signal, name)[:, None]
-        false = np.abs(getattr(found, name) / getattr(found, f"{name}_std")).max(axis=1)
+        error = found[name].values - getattr(signal, name)[:, None]
+        false = np.abs(found[name].values / found[name].uncertainty).max(axis=1)
         parabola = np.abs(plain[order, 0] / plain[order, 1] / noise).max(axis=1)
-        power = (np.mean(way[quiet] ** 2) if quiet.any() else np.nan for way in (getattr(found, name), plain[order, 0]))
+        power = (np.mean(way[quiet] ** 2) if quiet.any() else np.nan for way in (found[name].values, plain[order, 0]))
         verdicts.append(
             Verdict(
-                ratio=np.sqrt(np.mean((error / getattr(found, f"{name}_std")) ** 2, axis=1))[inner],
+                ratio=np.sqrt(np.mean((error / found[name].uncertainty) ** 2, axis=1))[inner],
                 near=float(false[beside].max()) if beside.any() else np.nan,
                 far=float(false[quiet].max()) if quiet.any() else np.nan,
                 near_parabola=float(parabola[beside].max()) if beside.any() else np.nan,
@@ -233,8 +235,8 @@ def rates_speed(quick: bool) -> Iterator[dict[str, object]]:
     noise = 0.01 * np.random.default_rng(0).normal(size=(len(t), nodes))
     std = np.full(noise.shape, 0.01)
     options = {"window": WINDOW - 1.0, "common_fraction": 0.0, "references": still}
-    rates(t, noise[:, :2], std[:, :2], **options)  # compiles
+    rates(t, Field(name="u", values=noise[:, :2], std=std[:, :2]), **options)  # compiles
     for name, motion in {"at rest": 0 * t, "swinging": 5 * np.sin(t / 6), "blows": 0.5 * abs(t % 80 - 40)}.items():
         start = time.process_time()
-        rates(t, noise + motion[:, None], std, **options)
+        rates(t, Field(name="u", values=noise + motion[:, None], std=std), **options)
         yield {"motion": name, "time [ms a node]": 1e3 * (time.process_time() - start) / nodes}

@@ -107,27 +107,8 @@ class Field:
         return selected
 
     @classmethod
-    def stack(cls, parts: Sequence[Self], dim: str = "frame") -> Self:
-        """Join fields along a new axis before the last one.
-
-        Parameters
-        ----------
-        parts
-            One field of each frame.
-        dim
-            Name of the new axis.
-
-        Returns
-        -------
-        Field
-        """
-        first, *others = parts
-        stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
-        return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
-
-    @classmethod
-    def join(cls, parts: Sequence[Self], dim: str) -> Self:
-        """Join fields along an axis that they have.
+    def concatenate(cls, parts: Sequence[Self], dim: str = "frame") -> Self:
+        """Join fields along one of their axes, or along a new one before the last.
 
         Parameters
         ----------
@@ -141,8 +122,11 @@ class Field:
         Field
         """
         first, *others = parts
-        axis = first.dims.index(dim) - len(first.dims)
-        return first.with_arrays(lambda *arrays: np.concatenate(arrays, axis=axis), *others)
+        if dim in first.dims:
+            axis = first.dims.index(dim) - len(first.dims)
+            return first.with_arrays(lambda *arrays: np.concatenate(arrays, axis=axis), *others)
+        stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
+        return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
 
     @property
     def is_doubtful(self) -> BoolArray:
@@ -257,13 +241,24 @@ class Displacement(Field):
         return replace(moved, covariance=covariance, std=std)
 
     @property
+    def error_factor(self) -> FloatArray:
+        """Factor F of the covariance ``F F^T`` of the errors at a node, shape (c, c, ..., N); 0 where not known."""
+        if self.covariance is None:
+            std = np.nan_to_num(self.uncertainty)
+            return np.asarray(np.einsum("ij,j...->ij...", np.eye(len(std)), std))
+        variances, axes = np.linalg.eigh(np.moveaxis(np.nan_to_num(self.covariance), (0, 1), (-2, -1)))
+        # the symmetric root: from node to node it changes as little as the covariance, and the errors are correlated
+        root = (axes * np.sqrt(np.maximum(variances, 0))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+        return np.asarray(np.moveaxis(root, (-2, -1), (0, 1)))
+
+    @property
     def is_measured(self) -> BoolArray:
         """Mask of the nodes all components of which are measured, shape (..., N)."""
         return np.asarray(np.isfinite(self.values + self.uncertainty).all(axis=0))
 
 
 class FieldSource(Protocol):
-    """What histories, profiles, maps, figures, movies and reports read of a result with T frames and N nodes.
+    """A result with T frames and N nodes as histories, profiles, maps, figures, movies and reports read it.
 
     `rgbmidic.results.result_in_units.ResultInUnits` is one, with two components in a plane. A third component is added
     by another source, and by nothing else: its `displacement` has three rows and their covariance, `components` three
@@ -305,7 +300,7 @@ class FieldSource(Protocol):
 
     @property
     def remarks(self) -> Iterable[str]:
-        """What a reader should know of lengths, a line each."""
+        """Remarks on the lengths, a line each."""
 
     @property
     def rectified(self) -> Rectification | None:

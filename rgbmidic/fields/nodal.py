@@ -179,28 +179,16 @@ class NodalCovariance:
         ndarray, shape (..., c S, c S)
             Sums of the first component, then those of the next.
         """
-        std, count = displacement.uncertainty[..., None, :], len(displacement.values)
-        if displacement.covariance is None:
-            bias = np.zeros_like(std) if displacement.bias is None else displacement.bias[..., None, :]
-            errors = [self.errors(weights, *terms) for terms in zip(std, bias, strict=True)]
-            blocks = [array @ np.swapaxes(array, -1, -2) for array in errors]
-            sums = weights.shape[-2]
-            covariance = np.zeros((*weights.shape[:-2], count, sums, count, sums))
-            for row, block in enumerate(blocks):
-                covariance[..., row, :, row, :] = block
-            return covariance.reshape(*weights.shape[:-2], count * sums, count * sums)
-        matrix = np.moveaxis(np.nan_to_num(displacement.covariance), (0, 1), (-2, -1))
-        variances, axes = np.linalg.eigh(matrix)
-        # the symmetric root: it changes as little from node to node as the covariance does
-        root = (axes * np.sqrt(np.maximum(variances, 0))[..., None, :]) @ np.swapaxes(axes, -1, -2)
-        factor = np.moveaxis(root, (-2, -1), (0, 1))[..., None, :]
-        shared = np.zeros_like(std) if displacement.bias is None else displacement.bias[..., None, :]
-        total = np.nan_to_num((std**2).sum(axis=0))
-        share = np.divide((shared**2).sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
-        terms = np.ones_like(share), np.sqrt(share)
-        rows = [[self.errors(weights * part, *terms) for part in row] for row in factor]
-        flat = np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
-        return np.asarray(flat @ np.swapaxes(flat, -1, -2))
+        factor = displacement.error_factor[..., None, :]
+        bias = np.zeros_like(factor)
+        if displacement.bias is not None:
+            bias[np.diag_indices(len(factor))] = np.nan_to_num(displacement.bias)[..., None, :]
+        rows = [
+            [self.errors(weights * np.sign(part), np.abs(part), shared) for part, shared in zip(*pair, strict=True)]
+            for pair in zip(factor, bias, strict=True)
+        ]
+        errors = np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
+        return np.asarray(errors @ np.swapaxes(errors, -1, -2))
 
     def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
         """Return the covariance of quantities (n,), each over its standard uncertainty.

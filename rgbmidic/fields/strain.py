@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import Any, Self
 
 import numpy as np
@@ -223,10 +224,10 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
             f"gradients (..., 2, 2) and their covariance (..., 4, 4) are needed, not {gradient.shape} and "
             f"{covariance.shape}"
         )
-    return _strain(gradient, covariance, measure)
+    return unchecked_strain(gradient, covariance, measure)
 
 
-def _strain(gradient: FloatArray, covariance: FloatArray, measure: str) -> Strain:
+def unchecked_strain(gradient: FloatArray, covariance: FloatArray, measure: str) -> Strain:
     """Compute `strain_of_gradient` of what is checked."""
     shape = gradient.shape[:-2]
     h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
@@ -565,19 +566,18 @@ class StrainGauges:
         covariance : ndarray, shape (G, 2 c, 2 c)
             Of the slopes row by row.
         """
-        measured, stated = displacement.is_measured, displacement.covariance
+        measured, count = displacement.is_measured, len(displacement.values)
         weights = self.full_weights if measured.all() else self.weights(measured)
         matrices = self.slopes if measured.all() else self._matrices(weights)
-        values, std = (np.where(measured, array, 0.0) for array in (displacement.values, displacement.uncertainty))
-        bias = np.zeros_like(std) if displacement.bias is None else np.where(measured, displacement.bias, 0.0)
+        values, factor = (np.where(measured, array, 0.0) for array in (displacement.values, displacement.error_factor))
+        bias = np.zeros_like(values) if displacement.bias is None else np.where(measured, displacement.bias, 0.0)
         gradient = np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in values], axis=1)
-        count, products = len(values), weights[[0, 1, 0]] * weights[[0, 1, 1]]
-        spread = np.zeros((len(self.centres), count, 2, count, 2))
-        for i, j in zip(*(np.arange(count)[:, None] >= np.arange(count)).nonzero(), strict=True):
-            if i != j and stated is None:
-                continue
-            square = std[i] ** 2 if stated is None else np.where(measured, stated[i, j], 0.0)
+        spread, products = np.zeros((len(gradient), count, 2, count, 2)), weights[[0, 1, 0]] * weights[[0, 1, 1]]
+        for i, j in combinations_with_replacement(range(count), 2):
+            square = (factor[i] * factor[j]).sum(axis=0)
             square = np.maximum(square - bias[i] ** 2, 0) if i == j else square
+            if i != j and not square.any():
+                continue
             sums = np.stack([self._sum(array * square[self.nodes]) for array in products], axis=1) * self.inflation
             if i == j and bias[i].any():
                 x, y = (slope @ (sp.diags(bias[i]) @ self.bias) for slope in matrices)
@@ -599,7 +599,7 @@ class StrainGauges:
         -------
         Strain
         """
-        return _strain(*self.gradient(displacement), measure)
+        return unchecked_strain(*self.gradient(displacement), measure)
 
     def _matrices(self, weights: FloatArray) -> list[sp.csr_matrix]:
         return [sp.csr_matrix((w, self.nodes, self.starts), shape=self.needed.shape) for w in weights]

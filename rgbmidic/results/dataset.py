@@ -7,7 +7,8 @@ Attributes follow the CF conventions: ``units`` ("1" where there is none), ``lon
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,12 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.quantities import QUANTITIES, SHARED, STRAIN_COLUMNS
+from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES, ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.timing import STAGES
+from rgbmidic.typing import AnyArray
 
 _COMPONENTS = ("exx", "eyy", "exy")
 """Quantities of the field table that are the components of one variable, `strain`; likewise of their uncertainties."""
@@ -28,53 +30,44 @@ _NUMBERED_AXES = {"brightness": ("brightness_part", ("gain", "offset")), "second
 """Dimension and coordinate of the axes that have a number in the field table in place of a name."""
 
 
-class _LazyQuantity(BackendArray):
-    """Quantities of the field table over all frames, stacked along a last axis where there are several.
+class _LazyArray(BackendArray):
+    """An array over all frames, which are read when it is indexed.
 
     Parameters
     ----------
-    result
-        It is read when the array is indexed.
-    names
-        Of one shape and type.
-    maps
-        Where they are fields in the reader's units, not as the table has them.
+    read
+        Reads a frame.
+    frame_count
+        Number of frames T.
+    blank
+        What a frame is that is not measured.
     """
 
-    def __init__(self, result: Result, names: tuple[str, ...], maps: Maps | None = None) -> None:
-        self.result, self.names, self.maps = result, names, maps
-        entries = {**QUANTITIES, **{entry.name: entry for entry in STRAIN_COLUMNS}}
-        self.blank = entries[names[0]].unmeasured(result.table.sizes)
-        self.dtype = self.blank.dtype
-        self.shape = (len(result), *self.blank.shape, *([len(names)] if len(names) > 1 else []))
+    def __init__(self, read: Callable[[int], AnyArray], frame_count: int, blank: AnyArray) -> None:
+        self.read, self.dtype, self.shape = read, blank.dtype, (frame_count, *blank.shape)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read_selection)
 
     def _read_selection(self, key: tuple[Any, ...]) -> Any:
         """Read the part at an outer key: a whole number, a slice or an array for each axis."""
-        frames = np.arange(len(self.result))[key[0]]
-        axis_keys = list(enumerate(key[1:]))[::-1]  # from the last axis: a whole number drops its axis
-
-        def select(values: Mapping[str, Any]) -> Any:
-            array = np.stack([values[name] for name in self.names], axis=-1).reshape(self.shape[1:])
-            for axis, index in axis_keys:
-                array = array[(slice(None),) * axis + (index,)]
-            return array
-
-        selected = np.empty((frames.size, *select(dict.fromkeys(self.names, self.blank)).shape), dtype=self.dtype)
-        for row, values in enumerate(self._frame_values(frames.reshape(-1).tolist())):
-            selected[row] = select(values)
+        frames = np.arange(self.shape[0])[key[0]]
+        selected = np.empty((frames.size, *self.shape[1:]), dtype=self.dtype)
+        for row, frame in enumerate(frames.reshape(-1).tolist()):
+            selected[row] = self.read(frame)
+        for axis, index in list(enumerate(key[1:], start=1))[::-1]:  # from the last axis: a whole number drops its axis
+            selected = selected[(slice(None),) * axis + (index,)]
         return selected.reshape((*frames.shape, *selected.shape[1:]))
 
-    def _frame_values(self, frames: list[int]) -> Iterable[Mapping[str, Any]]:
-        if self.maps is None:
-            return self.result.table.iterate(self.names, frames)
-        read_field, blank_values, finished = self.maps.read, dict.fromkeys(self.names, self.blank), self.result.finished
-        return (
-            {name: read_field(name, frame).values for name in self.names} if finished[frame] else blank_values
-            for frame in frames
-        )
+
+def _read_stored(result: Result, name: str, frame: int) -> Any:
+    return next(result.iterate(name, [frame]))
+
+
+def _read_fields(maps: Maps, names: Sequence[str], frame: int) -> AnyArray:
+    """Read fields in the reader's units, along a last axis where there are several."""
+    values = [maps.read(name, frame).values for name in names]
+    return values[0] if len(values) == 1 else np.stack(values, axis=-1)
 
 
 def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
@@ -95,13 +88,16 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
         attributes = entry.attributes | ({"units": maps.field(name).unit} if is_displacement else {})
         if is_displacement and plane:
             attributes["description"] = plane
-        lazy_array = indexing.LazilyIndexedArray(_LazyQuantity(result, (name,), maps if is_displacement else None))
-        variables[name] = xr.Variable(axes, lazy_array, attributes)
+        read = partial(_read_fields, maps, [name]) if is_displacement else partial(_read_stored, result, name)
+        lazy_array = _LazyArray(read, len(result), entry.unmeasured(result.table.sizes))
+        variables[name] = xr.Variable(axes, indexing.LazilyIndexedArray(lazy_array), attributes)
     for suffix, long_name in {"": "strain", "_std": "standard uncertainty of strain"}.items():
         names, note = tuple(f"{name}{suffix}" for name in _COMPONENTS), maps.processing_note("exx")
         attributes = {"units": "1", "long_name": long_name, "description": ": ".join(filter(None, [plane, note]))}
-        lazy_array = indexing.LazilyIndexedArray(_LazyQuantity(result, names, maps))
-        variables[f"strain{suffix}"] = xr.Variable(("frame", "node", "component"), lazy_array, attributes)
+        blank = np.full((len(result.nodes), len(names)), np.nan, dtype=np.float32)
+        lazy_array = _LazyArray(partial(_read_fields, maps, names), len(result), blank)
+        axes = ("frame", "node", "component")
+        variables[f"strain{suffix}"] = xr.Variable(axes, indexing.LazilyIndexedArray(lazy_array), attributes)
     variables["elements"] = xr.Variable(("element", "corner"), result.elements, SHARED["elements"].attributes)
     return xr.Dataset(variables, _coordinates(physical), _provenance(physical))
 

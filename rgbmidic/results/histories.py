@@ -280,7 +280,7 @@ def _read_probes(
         values, std = np.full((2, len(clock)), np.nan)
         values[[*motions]], std[[*motions]] = zip(*((one.values, one.uncertainty) for one in component), strict=True)
         histories.append(replace(component[0], dims=("frame",), values=values, std=std))
-    return [Displacement.stack(fields) for fields in of_probes], histories, speed
+    return [Displacement.concatenate(fields) for fields in of_probes], histories, speed
 
 
 def convert_history(

@@ -483,7 +483,7 @@ class Maps(Portable):
         else:
             fields = [maps.read(name, frame) for frame in frames.tolist()]
         series, rows = (
-            Field.stack(fields),
+            Field.concatenate(fields),
             slice(block_slice.start - padded_slice.start, block_slice.stop - padded_slice.start),
         )
         options: dict[str, Any] = {
@@ -494,7 +494,7 @@ class Maps(Portable):
         starts = range(0, len(self.result.nodes), _NODES_PER_BATCH)
         parts = [rates(clock, series.isel(node=slice(start, start + _NODES_PER_BATCH)), **options) for start in starts]
         return [
-            Field.join([part[quantity].isel(frame=rows) for part in parts], "node")
+            Field.concatenate([part[quantity].isel(frame=rows) for part in parts], "node")
             for quantity in ("velocity", "acceleration")
         ]
 

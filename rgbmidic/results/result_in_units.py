@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from operator import attrgetter
 from typing import Any, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
@@ -22,7 +22,7 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.quantity import ResultQuantity
-from rgbmidic.fields.strain import MEASURES, STRAIN, StrainGauges, strain_of_gradient
+from rgbmidic.fields.strain import MEASURES, STRAIN, StrainGauges, unchecked_strain
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.quantities import (
@@ -37,7 +37,7 @@ from rgbmidic.results.quantities import (
 )
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ScaleSettings
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -121,8 +121,9 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
-    finished = result.finished
-    stamps, numbers = result.time_ns[finished], result.number[finished]
+    finished = np.flatnonzero(result.finished)
+    read = [(values["time_ns"], values["number"]) for values in result.table.iterate(("time_ns", "number"), finished)]
+    stamps, numbers = np.array(read, dtype=np.int64).reshape(-1, 2).T
     if (stamps == UNKNOWN_TIME).any():
         recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
         rate = scale.frame_rate or recorded
@@ -210,30 +211,9 @@ class ResultInUnits(Portable):
     components: ClassVar[tuple[str, ...]] = ("u", "v")
     is_calibrated: ClassVar[bool] = False
 
-    @property
-    def path(self) -> Path:
-        """Folder of the result."""
-        return self.result.path
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of each frame, length T."""
-        return self.result.names
-
-    @property
-    def number(self) -> IntArray:
-        """Number of each frame, with gaps where frames are lost, shape (T,)."""
-        return np.asarray(self.result.number)
-
-    @property
-    def status(self) -> IntArray:
-        """Status of each frame, shape (T,)."""
-        return np.asarray(self.result.status)
-
-    @property
-    def finished(self) -> BoolArray:
-        """Mask of the frames that are measured, shape (T,)."""
-        return self.result.finished
+    path, names, number, status, finished = (
+        property(attrgetter(f"result.{name}")) for name in ("path", "names", "number", "status", "finished")
+    )
 
     @property
     def references(self) -> BoolArray:
@@ -252,7 +232,7 @@ class ResultInUnits(Portable):
 
     @property
     def remarks(self) -> Iterator[str]:
-        """What a reader should know of lengths, a line each."""
+        """Remarks on the lengths, a line each."""
         if (camera := self.rectified.camera) is not None:
             yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
         if self.units.mm_per_pixel is None:
@@ -353,10 +333,12 @@ class ResultInUnits(Portable):
     @cached_property
     def columns(self) -> dict[str, ResultQuantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
-        stored = [entry for entry in QUANTITIES.values() if entry.is_stackable and entry.name != "time_ns"]
-        # small strain gives way to finite strain
-        stored = [entry for entry in stored if not self.is_strain(entry.file_name)]
-        return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN_COLUMNS, *ELEMENT_STRAIN)}
+        stored = {entry.file_name: entry for entry in QUANTITIES.values() if entry.is_stackable}
+        finite = {"time_ns", *(entry.name for entry in STRAIN_COLUMNS)}  # small strain gives way to finite strain
+        stored = {name: entry for name, entry in stored.items() if name not in finite}
+        return {
+            entry.name: entry.with_units(self.units) for entry in (*stored.values(), *STRAIN_COLUMNS, *ELEMENT_STRAIN)
+        }
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
@@ -432,16 +414,15 @@ class ResultInUnits(Portable):
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""
-        record = self.result.frame(index).values
-        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std")
+        record = next(self.result.table.iterate(None, [index]))
+        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std").std
+        gradient = self.mesh.element_gradient(displacement.values.T)
         strain = self.gauges.strain(displacement, self.measure)
-        elements = self.mesh.element_gradient(displacement.values.T)
-        columns = {name: np.asarray(record[name]) for name in self.columns if name in record}
+        in_elements = unchecked_strain(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
+        columns: dict[str, Any] = {name: np.asarray(record[name]) for name in self.columns if name in record}
         for field in (*map(self.units.convert, displacement.components), *strain.values()):
-            columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
+            columns |= {field.name: field.values, f"{field.name}_std": field.std}
             if field.bias is not None:
                 columns[f"{field.name}_bias_std"] = field.bias
-        for name, std in zip(self.components, self.length * edge.uncertainty, strict=True):
-            columns[f"{name}_edge_std"] = std
-        strain = strain_of_gradient(elements, np.zeros((len(elements), 4, 4)), self.measure)
-        return columns | {entry.name: strain[entry.name.removesuffix("_element")].values for entry in ELEMENT_STRAIN}
+        columns |= zip(("u_edge_std", "v_edge_std"), self.length * np.asarray(edge), strict=True)
+        return columns | {f"{name}_element": in_elements[name].values for name in ("exx", "eyy", "exy")}

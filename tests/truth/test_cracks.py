@@ -127,8 +127,10 @@ def test_the_jump_is_measured_within_its_uncertainty_with_default_settings():
         )
         solutions = [*measure_sequence(states, reference=reference, region=region, mesh=mesh)]
         found = crack_jump(mesh.nodes, mesh.elements, as_nodal(solutions), (10, PATH[0][1]), PATH[1])
-        error = found.opening - opening_at(found.points[:, 0], opening)
-        ratios = np.stack([error / found.opening_std, found.sliding / found.sliding_std])[..., :-1]
+        error = found.opening.values - opening_at(found.points[:, 0], opening)
+        ratios = np.stack([error / found.opening.uncertainty, found.sliding.values / found.sliding.uncertainty])[
+            ..., :-1
+        ]
         measured.append(np.isfinite(ratios).mean())
         errors.append(ratios.reshape(2, -1))
     assert min(measured) > 0.9

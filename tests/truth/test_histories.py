@@ -6,7 +6,7 @@ import numpy as np
 from textures import Affine, Texture
 
 from rgbmidic import correlate
-from rgbmidic.fields import rates, reference_fraction
+from rgbmidic.fields import Field, rates, reference_fraction
 
 FRAMES, SHAPE, REGION = 10, (112, 112), (12, 12, 99, 99)
 NOISE = 4.0
@@ -32,14 +32,13 @@ def test_velocity_and_acceleration_are_as_far_off_as_they_say():
     still = np.zeros((1, *nodes.shape))
     measured = np.concatenate([still, np.stack([one.displacement for one in solutions])])
     std = np.concatenate([still, np.stack([one.displacement_std for one in solutions])])
-    found = rates(
-        TIMES, measured, std, window=9e-3, common_fraction=reference_fraction(1), references=np.arange(FRAMES) == 0
-    )
+    options = {"common_fraction": reference_fraction(1), "references": np.arange(FRAMES) == 0}
+    found = rates(TIMES, Field(name="u", values=measured, std=std), window=9e-3, **options)
     step = 1e-6
     before, now, after = (
         np.stack([motion(time + shift).displacement(nodes, SHAPE) for time in TIMES]) for shift in (-step, 0, step)
     )
     truth = {"velocity": (after - before) / (2 * step), "acceleration": (after - 2 * now + before) / step**2}
     for name, exact in truth.items():
-        ratio = np.sqrt(np.mean(((getattr(found, name) - exact) / getattr(found, f"{name}_std")) ** 2))
+        ratio = np.sqrt(np.mean(((found[name].values - exact) / found[name].std) ** 2))
         assert RIGHT[0] <= ratio <= RIGHT[1], (name, ratio)

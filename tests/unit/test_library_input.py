@@ -61,6 +61,7 @@ FIELD: dict[str, Any] = {"nodes": MESH.nodes, "elements": MESH.elements, "displa
 MOSAIC: dict[str, Any] = {"cfa": "RGGB", "black_level": 64.0, "white_level": 4095.0}
 MOSAIC["values"] = np.full((24, 24), 900, dtype=np.uint16)
 RATES = np.zeros(8), np.ones(8)
+RATED = fields.Field(name="u", values=RATES[0], std=RATES[1])
 TEXTURE = np.random.default_rng(0).uniform(100, 200, (20, 20))
 
 
@@ -117,8 +118,8 @@ MORE_ARGUMENTS: dict[str, Callable[[Any], object]] = {
     "truth": lambda value: fields.field_rms(MESH, np.zeros((3, 2)), value),
     "border": lambda value: fields.field_rms(MESH, np.zeros((3, 2)), np.zeros((2, 20, 20)), border=value),
     "sigma": lambda value: fields.high_pass(TEXTURE, value),
-    "times": lambda value: fields.rates(value, *RATES, window=3, common_fraction=0.5, references=[True] * 8),
-    "window": lambda value: fields.rates(range(8), *RATES, window=value, common_fraction=0.5, references=[True] * 8),
+    "times": lambda value: fields.rates(value, RATED, window=3, common_fraction=0.5, references=[True] * 8),
+    "window": lambda value: fields.rates(range(8), RATED, window=value, common_fraction=0.5, references=[True] * 8),
     "uncertainty": lambda value: fields.frame_covariance(value, 0.5, [True] + 6 * [False]),
     "common fraction": lambda value: fields.frame_covariance(RATES[1], value, [True] * 8),
     "number of reference frames": fields.reference_fraction,

@@ -327,7 +327,7 @@ class FieldsInView:
         of_gauge = {"Displacement": "extension", "Strain": "strain"}.get(group) if kind == "gauge" else None
         quantity_name = of_gauge or (name if isinstance(probe, Area) and group == "Strain" else None)
         if quantity_name and maps.since is None and not maps.rigid_removed:
-            displacement = Displacement.stack([self.displacement.isel(node=probe.nodes)])
+            displacement = Displacement.concatenate([self.displacement.isel(node=probe.nodes)])
             probe_histories = (
                 entry for entry in probe.histories(displacement) if entry.name == f"{probe.name}_{quantity_name}"
             )
@@ -356,7 +356,7 @@ class FieldsInView:
             return float(values.values[mean.nodes[nearest]]), math.nan
         components = {component.name: component for component in self.displacement.components}
         is_displacement = name in components
-        nodal = Field.stack([components.get(name, values).isel(node=mean.nodes)])
+        nodal = Field.concatenate([components.get(name, values).isel(node=mean.nodes)])
         has_std = bool(np.isfinite(nodal.uncertainty).any())
         has_data = np.isfinite(nodal.values + (nodal.uncertainty if has_std else 0))
         weights = mean.weights(has_data, linear=not (is_displacement or field.is_signed))[0][:, 0]

@@ -243,7 +243,7 @@ def test_a_run_in_parts_that_stopped_before_the_right_camera_goes_on(measured, p
     assert np.array_equal(StereoResult.open(moved)["w"], result["w"], equal_nan=True)
     assert len(StereoResult.open(moved).camera("right").nodes) == len(result["x"])
     shutil.rmtree(moved / "left")
-    with pytest.raises(ResultError, match="the result of the left camera, .* is not there any more"):
+    with pytest.raises(ResultError, match=r"the result of the left camera, .* is not there any more"):
         open_left(moved)
 
 

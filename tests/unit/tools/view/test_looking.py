@@ -376,7 +376,7 @@ def test_what_a_history_does_not_have_is_not_stated_too_exactly(tmp_path):
     assert (
         0.97 * std[around].min() < spread_of(label(shown, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
     )
-    std, told = maps.read("shear", 5).std, label(shown, "shear", "region", *PLACES["region"])
+    std, told = maps.read("magnitude", 5).std, label(shown, "magnitude", "region", *PLACES["region"])
     assert told.endswith(" at most")
     assert 0.97 * std.min() < spread_of(told) < 1.03 * std.max()
     assert label(shown, "misfit", "point", 50.0, 40.0) == ": 1"
