@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, TypeVar
 from rgbmidic.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rgbmidic.fields import Probe
     from rgbmidic.mesh import MeshSource
+    from rgbmidic.results import Result
     from rgbmidic.weights.light_weights import PrepareWeights
 
 T = TypeVar("T")
@@ -23,6 +26,8 @@ LIGHT_WEIGHTS: dict[str, Callable[[], PrepareWeights]] = {}
 MESH_SOURCES: dict[str, Callable[[], MeshSource]] = {}
 """Meshes of other origin, by the name under which a result keeps their document; ``mesh.file`` is "finite_elements"."""
 
+RESULTS: dict[str, Callable[[], Callable[[Path], Result]]] = {}
+"""Functions that open results of tools, by the file that marks their folder."""
 PROBES: dict[str, Callable[[], Callable[..., Probe]]] = {}
 """Probes by their kind; called as those of `rgbmidic.fields` are, with the `settings` and `units` beside."""
 

@@ -194,14 +194,62 @@ class Displacement(Field):
             for row, (name, values, std) in enumerate(arrays)
         )
 
+    def smaller(self, other: Self) -> Self:
+        """Return the displacement with the smaller one of the uncertainties of two, at each node.
+
+        Parameters
+        ----------
+        other
+            Of the same nodes.
+
+        Returns
+        -------
+        Displacement
+        """
+        flat = replace(self, covariance=None).with_arrays(np.minimum, replace(other, covariance=None))
+        flat = replace(flat, values=self.values)
+        if self.covariance is None or other.covariance is None:
+            return flat
+        traces = (np.einsum("ii...->...", one.covariance) for one in (self, other))
+        return replace(flat, covariance=np.where(np.less(*traces), self.covariance, other.covariance))
+
+    def since(self, base: Self, common_fraction: float) -> Self:
+        """Return the displacement since another frame.
+
+        Parameters
+        ----------
+        base
+            Displacement of the same nodes in that frame.
+        common_fraction
+            Fraction of the smaller variance that both have in common.
+
+        Returns
+        -------
+        Displacement
+        """
+        smaller = self.smaller(base)
+
+        def difference(now: FloatArray, before: FloatArray, shared: FloatArray) -> FloatArray:
+            return np.sqrt(np.maximum(now**2 + before**2 - 2 * common_fraction * shared**2, 0))
+
+        flat, *others = (replace(one, covariance=None) for one in (self, base, smaller))
+        moved = replace(flat.with_arrays(difference, *others), values=self.values - base.values)
+        if self.covariance is None or base.covariance is None or smaller.covariance is None:
+            return moved
+        covariance = self.covariance + base.covariance - 2 * common_fraction * smaller.covariance
+        std = np.sqrt(np.maximum(np.einsum("ii...->i...", covariance), 0))
+        return replace(moved, covariance=covariance, std=std)
+
     @property
     def error_factor(self) -> FloatArray:
         """Factor F of the covariance ``F F^T`` of the errors at a node, shape (c, c, ..., N); 0 where not known."""
         if self.covariance is None:
             std = np.nan_to_num(self.uncertainty)
             return np.asarray(np.einsum("ij,j...->ij...", np.eye(len(std)), std))
-        roots, axes = np.linalg.eigh(np.moveaxis(np.nan_to_num(self.covariance), (0, 1), (-2, -1)))
-        return np.asarray(np.moveaxis(axes * np.sqrt(np.maximum(roots, 0))[..., None, :], (-2, -1), (0, 1)))
+        variances, axes = np.linalg.eigh(np.moveaxis(np.nan_to_num(self.covariance), (0, 1), (-2, -1)))
+        # the symmetric root: from node to node it changes as little as the covariance, and the errors are correlated
+        root = (axes * np.sqrt(np.maximum(variances, 0))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+        return np.asarray(np.moveaxis(root, (-2, -1), (0, 1)))
 
     @property
     def is_measured(self) -> BoolArray:
@@ -277,6 +325,9 @@ class FieldSource(Protocol):
     @property
     def components(self) -> tuple[str, ...]:
         """Names of the components of the displacement."""
+
+    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
+        """Add to the uncertainty of what probes measure what a calibration leaves, where `units` does not."""
 
     @property
     def covariance(self) -> NodalCovariance:

@@ -44,15 +44,17 @@ def stereo(
     pairing: Annotated[str, Option(help="Pair frames by their times (auto) or by number.")] = "auto",
     overwrite: Overwrite = False,
     resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
+    frames: Annotated[str, Option(help="Only these, such as 1000:2000; when all are measured: --resume.")] = "",
     workers: Workers = 0,
-    csv: Annotated[bool, Option("--csv", help="Write a CSV file per frame into DIR/csv.")] = False,
     draw: Draw = False,
 ) -> None:
     """Measure shape, motion and surface strain in three dimensions with two cameras."""
-    from rgbmidic.tools.stereo import StereoSettings, measure_stereo
+    from rgbmidic.results import Maps
+    from rgbmidic.settings import read_range
+    from rgbmidic.tools.stereo import LeftResult, StereoSettings, measure_stereo, measure_stereo_part
 
-    if overwrite and resume:
-        raise InputError("--overwrite begins anew, --resume goes on: state one of them")
+    if overwrite and (resume or frames):
+        raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
     settings = StereoSettings(
         axes=_read_axes(axes),
         gauge=gauge,
@@ -61,6 +63,13 @@ def stereo(
     )
     try:
         with progress_bar("measuring") as progress:
+            if frames:
+                part = read_range(frames, "--frames")
+                measure_stereo_part(
+                    left, right, camera, out, part, settings, workers=workers or None, progress=progress
+                )
+                print(f"frames {frames} are measured; when all frames are: --resume instead")
+                return
             result = measure_stereo(
                 left,
                 right,
@@ -75,14 +84,11 @@ def stereo(
     except KeyboardInterrupt:
         note("what was finished is kept: run the same command again with --resume")
         raise
-    if csv:
-        result.write_csv(out / "csv", overwrite=overwrite or resume)
     if draw:
-        from rgbmidic.tools.report.style import save_figure
+        from rgbmidic.tools.report import write_maps
 
-        (out / "figures").mkdir(exist_ok=True)
-        for name in ("z", "u", "v", "w", "e1", "e2", "epipolar_common", "epipolar_change"):
-            save_figure(result.figure(name), out / "figures" / f"{name}.png")
+        names = ["z", "u", "v", "w", "e1", "e2", "epipolar_common", "epipolar_change"]
+        write_maps(Maps.from_result(LeftResult.of(result)), names, out / "figures", [len(result) - 1])
     _print_summary(result)
 
 

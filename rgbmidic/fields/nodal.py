@@ -21,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 import scipy.sparse as sp
 from numpy.polynomial import Chebyshev, Polynomial
+from scipy.spatial.transform import Rotation
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
@@ -31,6 +32,8 @@ from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
+_ABOUT_AXES = -np.array([[[(i - j) * (j - k) * (k - i) / 2 for j in range(3)] for i in range(3)] for k in range(3)])
+"""Of each axis of space the matrix whose product with an arm is the velocity of a rotation about it."""
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 
@@ -53,8 +56,8 @@ class NodalCovariance:
     bias : csr_matrix, shape (n, S)
         Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
         ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
-    surface : ndarray, shape (N, 3), or None
-        Places of the mesh's nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
+    surface : ndarray, shape (n, 3), or None
+        Places of the n nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
 
     Examples
     --------
@@ -91,6 +94,11 @@ class NodalCovariance:
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
         fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
         return cls(mesh=mesh, fit=unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
+
+    @property
+    def points(self) -> FloatArray:
+        """Places of the mesh's nodes, in space where they are known there."""
+        return self.mesh.nodes if self.surface is None else self.surface
 
     @property
     def correlation(self) -> sp.csr_matrix:
@@ -210,7 +218,8 @@ class NodalCovariance:
         NodalCovariance
         """
         fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
-        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
+        surface = None if self.surface is None else self.surface[nodes]
+        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)], surface=surface)
 
 
 def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
@@ -359,12 +368,14 @@ class RigidMotion:
 
     Attributes
     ----------
-    centre : ndarray, shape (2,)
-        Middle of the measured nodes on the reference, px: the shift is that of this point.
+    centre : ndarray, shape (c,)
+        Middle of the measured nodes on the reference: the shift is that of this point.
     shift
-        In px, shape (2,).
+        In the unit of the displacement, shape (c,).
     rotation
-        In rad, from x towards y; a number.
+        In rad: in the plane from x towards y, a number; in space the rotation vector, shape (3,).
+    back : ndarray, shape (c, c)
+        Rotation by the opposite angle.
 
     Examples
     --------
@@ -380,6 +391,7 @@ class RigidMotion:
     centre: FloatArray
     shift: Field
     rotation: Field
+    back: FloatArray
 
     @classmethod
     def of(cls, covariance: NodalCovariance, displacement: Displacement) -> Self:
@@ -390,7 +402,7 @@ class RigidMotion:
         covariance
             Of the mesh.
         displacement
-            Of its N nodes in one frame, shape (2, N); NaN where not measured.
+            Of its N nodes in one frame, shape (c, N); NaN where not measured.
 
         Returns
         -------
@@ -401,28 +413,38 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, is_measured = covariance.mesh.nodes, displacement.is_measured
+        nodes, is_measured, unit = covariance.points, displacement.is_measured, displacement.unit
         if is_measured.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
         centre = nodes[is_measured].mean(axis=0)
         arm, values = nodes[is_measured] - centre, displacement.values.T[is_measured]
         shift = values.mean(axis=0)
-        deformed = arm + values - shift
-        along, turned = (arm * deformed).sum(), (arm[:, 0] * deformed[:, 1] - arm[:, 1] * deformed[:, 0]).sum()
-        equal_weights = is_measured / is_measured.sum()
-        lever, angle = np.zeros((2, len(nodes))), float(np.arctan2(turned, along))
-        # d(angle) = sum of (arm, turned along) x d(moved) / (arm . there)
-        c, s = np.cos(angle), np.sin(angle)
-        lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
-        lever /= np.hypot(along, turned)
-        bias = np.zeros_like(displacement.values) if displacement.bias is None else displacement.bias
-        terms = [*zip(displacement.uncertainty, bias, strict=True)]
-        variances = [covariance.variance(equal_weights, *component) for component in terms]
-        turning = sum(covariance.variance(arms, *term) for arms, term in zip(lever, terms, strict=True))
+        left, _, right = np.linalg.svd(arm.T @ (arm + values - shift))
+        right[-1] *= np.sign(np.linalg.det(left @ right))  # no reflection
+        back = left @ right
+        # an error of the rotation is the sum of the levers, the turned arms across the axes, times the errors
+        turned, count = arm @ back, len(centre)
+        axes = _ABOUT_AXES if count == 3 else _ABOUT_AXES[2:, :2, :2]
+        normal = np.einsum("kij,lih,nj,nh->kl", axes, axes, turned, turned)
+        by_sums = np.zeros((count + len(axes), count, 1 + count))
+        by_sums[:count, :, 0] = np.eye(count)
+        by_sums[count:, :, 1:] = np.einsum("kl,lij->kij", np.linalg.pinv(normal), axes)
+        weights = np.zeros((1 + count, len(nodes)))
+        weights[:, is_measured] = np.vstack([np.full(len(arm), 1 / len(arm)), turned.T])
+        by_sums = by_sums.reshape(count + len(axes), -1)
+        std = np.sqrt(np.einsum("ka,ab,kb->k", by_sums, covariance.of_sums(weights, displacement), by_sums))
+        rotation = Rotation.from_matrix(back.T).as_rotvec() if count == 3 else np.arctan2(back[0, 1], back[0, 0])
         return cls(
             centre=centre,
-            shift=Field(name="rigid", unit="px", dims=("component",), values=shift, std=np.sqrt(variances)),
-            rotation=Field(name="rigid_rotation", unit="rad", dims=(), values=np.array(angle), std=np.sqrt(turning)),
+            shift=Field(name="rigid", unit=unit, dims=("component",), values=shift, std=std[:count]),
+            rotation=Field(
+                name="rigid_rotation",
+                unit="rad",
+                dims=("component",)[: np.ndim(rotation)],
+                values=np.asarray(rotation),
+                std=std[count:].reshape(np.shape(rotation)),
+            ),
+            back=back,
         )
 
     def removed(self, nodes: FloatArray, displacement: Displacement) -> Displacement:
@@ -432,48 +454,44 @@ class RigidMotion:
 
         Parameters
         ----------
-        nodes : ndarray, shape (N, 2)
-            In px on the reference.
+        nodes : ndarray, shape (N, c)
+            On the reference, in the unit of the displacement.
         displacement
-            In px, shape (2, N). The uncertainty of the rigid motion itself is not added: it is the less, the more nodes
+            Of the shape (c, N). The uncertainty of the rigid motion itself is not added: it is the less, the more nodes
             there are.
 
         Returns
         -------
         Displacement
         """
-        arm = nodes - self.centre
-        turned = displacement.with_arrays(lambda std: np.sqrt(self.back**2 @ std**2))
+        arm, covariance = nodes - self.centre, displacement.covariance
+        turned = replace(displacement, covariance=None).with_arrays(lambda std: np.sqrt(self.back**2 @ std**2))
+        if covariance is not None:
+            covariance = np.einsum("ia,abn,jb->ijn", self.back, covariance, self.back)
+            turned = replace(turned, covariance=covariance, std=np.sqrt(np.einsum("iin->in", covariance)))
         remaining = (arm + displacement.values.T - self.shift.values) @ self.back.T - arm
         return replace(turned, values=remaining.T)
 
     @property
-    def components(self) -> Field:
-        """Shift in px and rotation in degrees, shape (3,)."""
-        terms = zip(
-            (self.shift.values, self.shift.uncertainty),
-            (self.rotation.values, self.rotation.uncertainty),
-            strict=True,
-        )
-        values, std = (np.append(shift, np.degrees(angle)) for shift, angle in terms)
-        return Field(name="rigid", dims=("component",), values=values, std=std)
-
-    @property
-    def back(self) -> FloatArray:
-        """Rotation (2, 2) by the opposite angle."""
-        c, s = np.cos(self.rotation.values), np.sin(self.rotation.values)
-        return np.array([[c, s], [-s, c]])
+    def components(self) -> tuple[Field, ...]:
+        """Shift along each axis, and rotation in degrees, about each axis of space."""
+        degrees = replace(self.rotation.with_arrays(np.degrees), unit="deg")
+        parts = [(f"rigid_{name}", self.shift, row) for row, name in enumerate("uvw"[: len(self.centre)])]
+        if not degrees.values.ndim:
+            return (*(replace(field.isel(component=row), name=name) for name, field, row in parts), degrees)
+        parts += [(f"rigid_rotation_{name}", degrees, row) for row, name in enumerate("xyz")]
+        return tuple(replace(field.isel(component=row), name=name) for name, field, row in parts)
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.
+        """Compute the displacement (P, c) of points (P, c) by the rigid motion alone.
 
         Parameters
         ----------
-        points : ndarray, shape (P, 2)
-            Points (x, y) on the reference, px.
+        points : ndarray, shape (P, c)
+            Points on the reference, in the unit of the displacement.
 
         Returns
         -------
-        ndarray, shape (P, 2)
+        ndarray, shape (P, c)
         """
-        return np.asarray((points - self.centre) @ (self.back - np.eye(2)) + self.shift.values)
+        return np.asarray((points - self.centre) @ (self.back - np.eye(len(self.centre))) + self.shift.values)

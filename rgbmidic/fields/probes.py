@@ -24,6 +24,7 @@ from rgbmidic.fields.interpolation import MeshPoints, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.tangent_plane import in_tangent_plane
 from rgbmidic.fields.units import Units
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
@@ -346,7 +347,11 @@ class StrainGauge:
 def _strain(slopes: FloatArray, displacement: Displacement, covariance: NodalCovariance, measure: str) -> Strain:
     """Compute the strain (T,) of the displacement gradient that weights (T, 2, m) of the nodes give."""
     gradient = np.stack([_products(slopes, values[:, None]).sum(axis=2) for values in displacement.values], axis=1)
-    return strain_of_gradient(gradient, covariance.of_sums(slopes, displacement), measure)
+    spread = covariance.of_sums(slopes, displacement)
+    if covariance.surface is not None:
+        tangents = np.stack([_products(slopes, nodes).sum(axis=2) for nodes in covariance.surface.T], axis=1)
+        gradient, spread = in_tangent_plane(tangents, gradient, spread)
+    return strain_of_gradient(gradient, spread, measure)
 
 
 class Area(Mean):
@@ -469,6 +474,8 @@ def make_probe(
     """
     (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
+    if covariance.surface is not None and kind in ("crack", "tip"):
+        raise InputError(f"{name}: cracks are measured in a plane, not on a surface in space: take one camera's result")
     if len(coordinates) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(coordinates)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}

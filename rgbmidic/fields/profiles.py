@@ -121,8 +121,10 @@ class ProfileLine:
     ----------
     points : ndarray, shape (P, 2)
         In px on the reference, from the first end to the last.
+    surface : ndarray, shape (P, 3), or None
+        Where the points are on a surface in space, NaN outside of it; None: it is in the mesh's plane.
     positions : ndarray, shape (P,)
-        Distance from the first end, px.
+        Distance from the first end, px, or along the surface in its unit.
     nodes : ndarray, shape (n,), int
         Nodes around the line.
     mesh_points
@@ -169,6 +171,11 @@ class ProfileLine:
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.mesh_points = mesh_points.nearby()
+        self.surface = None if covariance.surface is None else mesh_points.read(covariance.surface)
+        if self.surface is not None:
+            steps_in_space = np.linalg.norm(np.diff(self.surface, axis=0), axis=1)
+            outside = np.nanmedian(steps_in_space)  # the surface is not known there
+            self.positions = np.append(0.0, np.cumsum(np.where(np.isfinite(steps_in_space), steps_in_space, outside)))
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
         nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)

@@ -28,6 +28,7 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.tangent_plane import in_tangent_plane
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings.schema import STRAIN_MEASURES
@@ -437,7 +438,7 @@ class StrainGauges:
         np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _MARGIN / 2 * mesh.sizes[node])
         lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
-        self.starts, self.bias = pattern.indptr, covariance.bias
+        self.starts, self.bias, self.surface = pattern.indptr, covariance.bias, covariance.surface
         self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
         self.nodes = pattern.indices.astype(np.int64)
         distance = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
@@ -509,6 +510,7 @@ class StrainGauges:
         """
         gauges = copy(self)
         gauges.points, gauges.needed, gauges.bias = self.points[nodes], self.needed[:, nodes], self.bias[nodes]
+        gauges.surface = None if self.surface is None else self.surface[nodes]
         gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [matrix[:, nodes] for matrix in self.slopes]
         return gauges
 
@@ -522,10 +524,66 @@ class StrainGauges:
 
         Returns
         -------
-        gradient : ndarray, shape (G, c, 2)
-            ``H[c, d]``: derivative of the displacement c by the coordinate d.
-        covariance : ndarray, shape (G, 2 c, 2 c)
+        gradient : ndarray, shape (G, 2, 2)
+            ``H[c, d]``: derivative of the displacement c by the coordinate d; of a displacement in space that in the
+            tangent plane of the surface, see `in_tangent_plane`.
+        covariance : ndarray, shape (G, 4, 4)
             Of the gradient row by row.
+        """
+        slopes, covariance = self.slopes_of(displacement)
+        if self.surface is None:
+            return slopes, covariance
+        return in_tangent_plane(self.tangents(displacement.is_measured), slopes, covariance)
+
+    def tangents(self, measured: BoolArray) -> FloatArray:
+        """Fit the planes to the nodes in space, as to the displacements of those of them that have data.
+
+        Parameters
+        ----------
+        measured : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (G, 3, 2)
+        """
+        assert self.surface is not None
+        return self.fit(self.surface, measured)
+
+    def fit(self, values: FloatArray, measured: BoolArray) -> FloatArray:
+        """Fit the planes to nodal values of any shape.
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, ...)
+            Of all nodes; those that have no data do not count.
+        measured : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (G, ..., 2)
+            Their slopes along x and y of the mesh.
+        """
+        matrices = self.slopes if measured.all() else self._matrices(self.weights(measured))
+        flat = np.where(measured[:, None], values.reshape(len(values), -1), 0.0)
+        slopes = np.stack([slope @ flat for slope in matrices], axis=-1)
+        return np.asarray(slopes.reshape(len(slopes), *values.shape[1:], 2))
+
+    def slopes_of(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
+        """Fit the planes to each component of the displacements of one frame.
+
+        Parameters
+        ----------
+        displacement
+            As of `gradient`.
+
+        Returns
+        -------
+        slopes : ndarray, shape (G, c, 2)
+            Derivative of the displacement c by the coordinate d of the mesh.
+        covariance : ndarray, shape (G, 2 c, 2 c)
+            Of the slopes row by row.
         """
         measured, count = displacement.is_measured, len(displacement.values)
         weights = self.full_weights if measured.all() else self.weights(measured)
@@ -552,7 +610,7 @@ class StrainGauges:
         Parameters
         ----------
         displacement
-            As of `gradient`, with two components.
+            As of `gradient`.
         measure
             Strain measure, as of `strain_of`.
 

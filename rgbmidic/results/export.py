@@ -242,7 +242,10 @@ def export_result(
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     check_file(out, overwrite=overwrite)
     physical = ResultInUnits.from_result(result, scale)
-    write_complete(out, lambda file: _WRITERS[to](physical, file))
+    if (exporter := physical.exporter) is not None:
+        write_complete(out, lambda file: exporter(to, file))
+    else:
+        write_complete(out, lambda file: _WRITERS[to](physical, file))
 
 
 def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:

@@ -234,6 +234,7 @@ def read_histories(
     quantities = tuple(
         quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
     )
+    quantities = tuple(source.with_calibration(quantities))
     remarks = [*source.remarks, *_remarks(source, base, speed, by_probe)]
     if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
@@ -260,8 +261,8 @@ def _read_probes(
 ) -> tuple[list[Displacement], list[Field], FloatArray]:
     """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
     of_probes: list[list[Displacement]] = [[] for _ in probes]
-    nothing = Field(name="", values=np.full(3, np.nan), std=np.full(3, np.nan), dims=("component",))
-    motions, speed, previous = [nothing] * len(clock), np.full(len(clock), np.nan), np.full(1, np.nan)
+    motions = dict[int, RigidMotion]()
+    speed, previous = np.full(len(clock), np.nan), np.full(1, np.nan)
     for row, frame in enumerate(frames.tolist()):
         displacement = source.displacement(frame)
         step = np.linalg.norm(displacement.values - previous, axis=0)
@@ -270,16 +271,15 @@ def _read_probes(
             speed[row] = np.nanpercentile(step, 95) / (clock[row] - clock[row - 1])
         previous = displacement.values
         if rigid_motion != "none" and displacement.is_measured.sum() > 1:
-            motion = RigidMotion.of(source.covariance, displacement)
-            motions[row] = motion.components
-            displacement = motion.removed(source.mesh.nodes, displacement) if rigid_motion == "remove" else displacement
+            motions[row] = motion = RigidMotion.of(source.covariance, displacement)
+            displacement = motion.removed(source.points, displacement) if rigid_motion == "remove" else displacement
         for fields, probe in zip(of_probes, probes, strict=True):
             fields.append(displacement.isel(node=probe.nodes))
-    rigid = Field.concatenate(motions)
-    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid_motion != "none" else {}
-    histories = [
-        replace(rigid.isel(component=row), name=name, unit=unit) for row, (name, unit) in enumerate(names.items())
-    ]
+    histories = []
+    for component in zip(*(motion.components for motion in motions.values()), strict=True):
+        values, std = np.full((2, len(clock)), np.nan)
+        values[[*motions]], std[[*motions]] = zip(*((one.values, one.uncertainty) for one in component), strict=True)
+        histories.append(replace(component[0], dims=("frame",), values=values, std=std))
     return [Displacement.concatenate(fields) for fields in of_probes], histories, speed
 
 
@@ -289,7 +289,11 @@ def convert_history(
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
     converted, is_length = units.convert(history), history.unit in ("px", "mm")
     yield converted
-    if history.std is None or compute_rates is None or (history.unit == "deg" and history.name != "rigid_rotation"):
+    if (
+        history.std is None
+        or compute_rates is None
+        or (history.unit == "deg" and not history.name.startswith("rigid_rotation"))
+    ):
         return
     rate_fields = compute_rates(history)
     for power, name in enumerate(("velocity", "acceleration") if is_length else ("velocity",), start=1):

@@ -24,7 +24,7 @@ from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, st
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, map_quantities
+from rgbmidic.results.quantities import UNKNOWN_TIME, UV, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ProbeSettings, ScaleSettings
@@ -101,7 +101,7 @@ class Maps(Portable):
         InputError
             As of `with_options`.
         """
-        return cls(result=result, physical=ResultInUnits.without_times(result, scale)).with_options(**choices)
+        return cls(result=result, physical=result.in_units(scale)).with_options(**choices)
 
     def with_options(
         self,
@@ -199,7 +199,8 @@ class Maps(Portable):
         elif field.group == "Strain":
             phrases = [self.physical.strain_description(base), since]
         elif field.group == "Rates" and len(self._measured_frames) >= FEWEST:
-            strain = "" if DERIVED[base].unit else self.physical.strain_description(base)
+            is_strain = not {*field.base_quantities} <= {*self.physical.components}
+            strain = self.physical.strain_description(base) if is_strain else ""
             phrases = [strain, rate_words(self.window, len(self._measured_frames))]
         return ", ".join(filter(None, phrases))
 
@@ -260,18 +261,25 @@ class Maps(Portable):
 
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
         """Compute a displacement or a rate in the reader's units."""
+        source, names, covariance = self._current, entry.base_quantities, None
+        is_vector = {*names} <= {*source.components}
         if entry.order:
-            parts = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
-            values, std = (np.stack([getattr(part, name) for part in parts]) for name in ("values", "uncertainty"))
-            vector = Displacement(unit=parts[0].unit, dims=("component", "node"), values=values, std=std)
+            needed = source.components if source.is_calibrated and is_vector else names
+            by_name = {name: self._rates(name, frame, entry.order) for name in needed}
         else:
-            vector = self.displacement(frame)
-            parts = [part for part in vector.components if part.name in entry.base_quantities]
-        field = parts[0]
-        if len(parts) > 1:
-            factor = vector.error_factor
-            length, std = length_of(vector.values.T, np.einsum("irn,jrn->nij", factor, factor))
-            field = replace(field, values=length, std=np.where(vector.is_measured, std, np.nan), bias=None)
+            displacement = self.displacement(frame)
+            by_name, covariance = {one.name: one for one in displacement.components}, displacement.covariance
+        field = by_name[names[0]]
+        if len(names) > 1:
+            vector, error = (
+                np.stack(arrays, axis=1)
+                for arrays in zip(*((by_name[name].values, by_name[name].uncertainty) for name in names), strict=True)
+            )
+            matrix = error[:, :, None] ** 2 * np.eye(len(names))
+            length, std = length_of(vector, matrix if covariance is None else np.moveaxis(covariance, 2, 0))
+            field = replace(field, values=length, std=std, bias=None)
+        if is_vector:
+            field = source.calibrated(field, by_name, names)
         return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
 
     def displacement(self, frame: int) -> Displacement:
@@ -289,7 +297,7 @@ class Maps(Portable):
         """
         displacement = self._relative_displacement(frame)
         motion = self._rigid(displacement)
-        return displacement if motion is None else motion.removed(self._covariance.mesh.nodes, displacement)
+        return displacement if motion is None else motion.removed(self._covariance.points, displacement)
 
     def triangulate(self, field: ResultQuantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
         """Return nodal values as pictures draw them, linear in triangles, and the triangles.
@@ -371,13 +379,7 @@ class Maps(Portable):
         displacement = self._current.displacement(frame)
         if self.since is None:
             return displacement
-        base, factor = self._base_displacement, self._shared_fraction(frame)
-
-        def difference_std(now: FloatArray, before: FloatArray) -> FloatArray:
-            return np.sqrt(np.maximum(now**2 + before**2 - 2 * factor * np.minimum(now, before) ** 2, 0))
-
-        difference = displacement.with_arrays(difference_std, base)
-        return replace(difference, values=displacement.values - base.values)
+        return displacement.since(self._base_displacement, self._shared_fraction(frame))
 
     @cached_property
     def _base_displacement(self) -> Displacement:
@@ -395,9 +397,11 @@ class Maps(Portable):
         """Correlation of the nodes' errors, with the nodes where they are at the reference."""
         if self.since is None:
             return self.physical.covariance
-        mesh = self.physical.mesh
-        deformed = mesh.nodes + np.nan_to_num(self._base_displacement.values.T)
-        return replace(self.physical.covariance, mesh=Tri3Mesh(nodes=deformed, elements=mesh.elements))
+        deformed = self.physical.points + np.nan_to_num(self._base_displacement.values.T)
+        if deformed.shape[1] > 2:
+            return replace(self.physical.covariance, surface=deformed)
+        mesh = Tri3Mesh(nodes=deformed, elements=self.physical.mesh.elements)
+        return replace(self.physical.covariance, mesh=mesh)
 
     def _rigid(self, displacement: Displacement) -> RigidMotion | None:
         """Fit the rigid motion that is removed; None where none is, or fewer than two nodes are measured."""
@@ -420,13 +424,12 @@ class Maps(Portable):
                 for one in (displacement, self._base_displacement)
             )
             factor = self._shared_fraction(frame)
-            smaller = present.with_arrays(lambda now, before: np.sqrt(abs(factor)) * np.minimum(now, before), base)
-            shared_covariance = np.sign(factor) * gauges.gradient(smaller)[1]
+            shared_covariance = factor * gauges.gradient(present.smaller(base))[1]
             gradient, covariance = _relative_gradient(
                 gauges.gradient(present), gauges.gradient(base), shared_covariance
             )
         motion = self._rigid(self._relative_displacement(frame))
-        if motion is not None:
+        if motion is not None and len(motion.back) == 2:  # in the tangent plane nothing turns
             wide = np.kron(motion.back, np.eye(2))
             gradient, covariance = motion.back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
         return strain_of_gradient(gradient, covariance, self.physical.measure)

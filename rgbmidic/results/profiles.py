@@ -157,7 +157,16 @@ class Profile:
     @property
     def positions(self) -> FloatArray:
         """Distance (P,) of the points from the first end, in the unit of lengths."""
-        return self.line.positions * (self.units.mm_per_pixel or 1.0)
+        return self.line.positions * self._scale
+
+    @property
+    def places(self) -> FloatArray:
+        """Places (P, 2) of the points on the reference, or (P, 3) in space, in the unit of lengths."""
+        return self._scale * (self.line.points if self.line.surface is None else self.line.surface)
+
+    @property
+    def _scale(self) -> float:
+        return (self.units.mm_per_pixel or 1.0) if self.line.surface is None else 1.0
 
     @property
     def clock(self) -> FloatArray:
@@ -274,8 +283,8 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     for file in (out, *([arrivals_path] if wave else [])):
         check_file(file, overwrite=overwrite)
     unit, value = profile.units.length, column(profile.field.name, profile.field.unit)
-    head = [column(name, unit) for name in ("position", "x", "y")]
-    positions = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
+    head = [column(name, unit) for name in ("position", *"xyz"[: profile.places.shape[1]])]
+    positions = np.column_stack([profile.positions, profile.places])
     time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.threads import machine
 from rgbmidic._version import __version__
 from rgbmidic.errors import AnotherTestError, ResultError
+from rgbmidic.extensions import RESULTS
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
 from rgbmidic.mesh import MeshLabels
@@ -191,6 +192,11 @@ def with_checksum(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _canonical(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, sort_keys=True).encode()
+
+
+def find_marker(path: Path) -> Path | None:
+    """Return the file that marks a folder as that of a result, of a run or of a tool; None where there is none."""
+    return next((path / name for name in (PROVENANCE, *RESULTS) if (path / name).exists()), None)
 
 
 def is_result(path: Path) -> bool:

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError, import_optional
+from rgbmidic.extensions import RESULTS
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import (
@@ -21,6 +22,7 @@ from rgbmidic.results.provenance import (
     RESTORE_REMEDY,
     current_time,
     digest,
+    find_marker,
     fingerprint,
     read_provenance,
     with_checksum,
@@ -118,7 +120,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
     @classmethod
     @checked
     def open(cls, path: Path | str, *, partial: bool = False, check: bool = True) -> Self:
-        """Open a result folder.
+        """Open a result folder, also one of a tool (`rgbmidic.extensions.RESULTS`), such as that of two cameras.
 
         Parameters
         ----------
@@ -140,6 +142,8 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
             The folder is not a result, is damaged, or is incomplete (unless `partial`).
         """
         path = Path(path)
+        if (marker := find_marker(path)) and (load := RESULTS.get(marker.name)):
+            return cast("Self", load()(path))
         provenance = read_provenance(path)
         shared, lights = read_shared(path, provenance), tuple(provenance["lights"])
         sizes = {"node": len(shared["nodes"]), "light": len(lights)}

@@ -8,11 +8,11 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -191,13 +191,10 @@ class ResultInUnits(Portable):
     gauge: float | None = None
     measure: str = MEASURES[0]
 
-    @classmethod
-    def from_result(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
+    @staticmethod
+    def from_result(result: Result, scale: ScaleSettings | None = None) -> ResultInUnits:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
-        base, times = cls.without_times(result, scale), frame_times(result, scale)
-        if times is None or not (np.diff(times) > 0).all():
-            return base
-        return replace(base, times=times, units=replace(base.units, timed=True))
+        return result.in_units(scale).with_times()
 
     @classmethod
     def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
@@ -205,7 +202,14 @@ class ResultInUnits(Portable):
         rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
 
+    def with_times(self) -> Self:
+        """Read the times of all frames."""
+        if (times := self.seconds) is None or not (np.diff(times) > 0).all():
+            return self
+        return replace(self, times=times, units=replace(self.units, timed=True))
+
     components: ClassVar[tuple[str, ...]] = ("u", "v")
+    is_calibrated: ClassVar[bool] = False
 
     path, names, number, status, finished = (
         property(attrgetter(f"result.{name}")) for name in ("path", "names", "number", "status", "finished")
@@ -394,6 +398,19 @@ class ResultInUnits(Portable):
         if len(error) > 1:
             return np.asarray(np.fmax.reduce(error / std))
         return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
+
+    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
+        """Add to the uncertainty of a vector's component or length what a calibration leaves; a scale's is in units."""
+        return field
+
+    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
+        """Add to the uncertainty of what probes measure what a calibration leaves; a scale's is in units."""
+        return histories
+
+    @property
+    def exporter(self) -> Callable[[str, BinaryIO], None] | None:
+        """Function that writes the result for other programs into a file; None: those of `rgbmidic.results.export`."""
+        return None
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""

@@ -208,6 +208,11 @@ class Comparison:
         frames: Sequence[int] | None = None,
         remove_rigid: bool = False,
     ) -> None:
+        if (components := result.in_units(scale).components) != ("u", "v"):
+            raise InputError(
+                f"{result.path} has the displacements {', '.join(components)}; a simulation is compared with u and v, "
+                "those that one camera measures in a plane: take its result"
+            )
         self.result, self.simulation, self.placement, self.remove_rigid = result, simulation, placement, remove_rigid
         times = frame_times(result, scale)
         self.has_times = times is not None

@@ -57,6 +57,8 @@ class TimeHistory:
         Whether the times are known.
     fields : dict
         What each quantity is.
+    components, component_stds : tuple of str
+        Names of the components of the displacement, and of their standard uncertainties.
     quantiles : dict
         Of each quantity the 5 %, 50 % and 95 % quantile over the nodes, shape (F, 3); NaN where nothing is measured.
     fractions : ndarray, shape (F, S)
@@ -72,7 +74,9 @@ class TimeHistory:
 
     def __init__(self, physical: ResultInUnits, frames: Sequence[int]) -> None:
         self.frames, self.has_times, times = tuple(frames), physical.units.timed, physical.times[list(frames)]
-        names = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
+        self.components = physical.components
+        self.component_stds = tuple(f"{name}_std" for name in self.components)
+        names = (*self.components, *self.component_stds, "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
         self.axis = style.time_axis(times if self.has_times else None, physical.result.number[list(frames)])
         self.fields = Maps(result=physical.result, physical=physical).quantities
         self.quantiles = {name: np.full((len(times), 3), np.nan) for name in names}
@@ -85,9 +89,9 @@ class TimeHistory:
                     quantiles[row] = np.quantile(finite, (0.05, 0.5, 0.95))
             codes = range(self.fractions.shape[1])
             self.fractions[row] = [(values["node_status"] == code).mean() for code in codes]
-            displacement = np.stack([values["u"], values["v"]]) / physical.length
+            displacement = np.stack([values[name] for name in self.components]) / physical.length
             if row:
-                step = np.hypot(*(displacement - previous)) / (times[row] - times[row - 1])
+                step = np.linalg.norm(displacement - previous, axis=0) / (times[row] - times[row - 1])
                 self.fastest = max(self.fastest, float(np.nan_to_num(step).max(initial=0)))
             previous = displacement
 
@@ -106,7 +110,7 @@ class TimeHistory:
 
     def key_frames(self, count: int) -> tuple[int, ...]:
         """Select frames between which the field changes by about as much: its quantiles' path in equal parts."""
-        fields = np.stack([self.quantiles[name] for name in ("u", "v")])
+        fields = np.stack([self.quantiles[name] for name in self.components])
         measured_rows = np.flatnonzero(np.isfinite(fields).all(axis=(0, 2)))
         if not len(measured_rows):
             return ()
@@ -117,7 +121,7 @@ class TimeHistory:
     @property
     def farthest(self) -> int:
         """The frame whose median displacement is the largest."""
-        length = np.hypot(self.quantiles["u"][:, 1], self.quantiles["v"][:, 1])
+        length = np.linalg.norm([self.quantiles[name][:, 1] for name in self.components], axis=0)
         return self.frames[int(np.nan_to_num(length).argmax())]
 
 

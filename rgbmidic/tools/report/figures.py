@@ -217,6 +217,24 @@ class MapDrawer:
             return None
         return self.fields(frame, ("u_total", "v_total", "finer_mesh"))
 
+    def kind(self, frame: int, kind: str) -> Figure:
+        """Draw the maps of a kind of one frame, of all components of the displacement; errors as `fields`.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+        kind
+            Key of `MAPS`.
+
+        Returns
+        -------
+        Figure
+        """
+        names, others = MAPS[kind], self.maps.physical.components[2:]
+        more = [name.replace("v", other, 1) for other in others for name in names if name in ("v", "v_std")]
+        return self.fields(frame, [*names, *more])
+
     def fields(self, frame: int, names: Sequence[str], *, std: bool = False, hatched: bool = False) -> Figure:
         """Draw maps of fields of one frame, blank where not measured.
 

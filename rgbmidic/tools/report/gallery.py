@@ -36,7 +36,7 @@ _TEST_FIGURES: Mapping[str, Callable[[Result], Figure]] = {
     "brightness": brightness_figure,
 }
 _FRAME_FIGURES: Mapping[str, Callable[[MapDrawer, int], Figure | None]] = {
-    **{kind: partial(MapDrawer.fields, names=names) for kind, names in MAPS.items()},
+    **{kind: partial(MapDrawer.kind, kind=kind) for kind in MAPS},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
     "masks": MapDrawer.masks,
     "discretisation": MapDrawer.discretisation,

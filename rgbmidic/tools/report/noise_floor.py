@@ -49,7 +49,7 @@ def noise_floor(physical: ResultInUnits, max_frames: int = 50) -> NoiseFloor | N
     NoiseFloor or None
         None where fewer than two frames of the reference are measured.
     """
-    result, names = physical.result, ("u", "v", "exx", "eyy", "exy")
+    result, names = physical.result, (*physical.components, "exx", "eyy", "exy")
     static = [frame_index for frame_index in result.provenance["references"] if result.status[frame_index] != FAILED][
         :max_frames
     ]

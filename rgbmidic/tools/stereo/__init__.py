@@ -8,10 +8,12 @@ from rgbmidic.tools.stereo.axes import Axes
 from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh, carry_mesh
-from rgbmidic.tools.stereo.result import QUANTITIES, StereoResult
-from rgbmidic.tools.stereo.run import StereoSettings, measure_stereo
+from rgbmidic.tools.stereo.left_result import LeftResult, open_left
+from rgbmidic.tools.stereo.result import StereoResult
+from rgbmidic.tools.stereo.run import StereoSettings, measure_stereo, measure_stereo_part
 from rgbmidic.tools.stereo.shape import Shape
-from rgbmidic.tools.stereo.surface import SurfaceGauges
+from rgbmidic.tools.stereo.stereo_file import QUANTITIES
+from rgbmidic.tools.stereo.surface import SurfaceGauges, SurfaceStrain
 from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
 
 __all__ = [
@@ -21,12 +23,16 @@ __all__ = [
     "CalibrationPart",
     "CameraPair",
     "CarriedMesh",
+    "LeftResult",
     "Shape",
     "StereoResult",
     "StereoSettings",
     "SurfaceGauges",
+    "SurfaceStrain",
     "Triangulation",
     "carry_mesh",
     "measure_stereo",
+    "measure_stereo_part",
+    "open_left",
     "triangulate",
 ]

@@ -15,8 +15,11 @@ import numpy as np
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
-from rgbmidic.tools.stereo.triangulation import Triangulation
+from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
 from rgbmidic.typing import FloatArray
+
+_SAMPLED = 200
+"""Nodes over which the error of displacements is averaged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,6 +113,28 @@ class CalibrationPart:
         )
         turned = np.einsum("ijm,nj->nim", self.turn, deformed.points - reference.points)
         return np.asarray(np.einsum("ij,njm->nim", self.rotation, after - before) + turned)
+
+
+    def mean_gain(self, points: FloatArray) -> FloatArray:
+        """Return the errors (3, 3, M) of a displacement along the first index per mm along the second, over the nodes.
+
+        It is smooth over the frame, by lens and pose, so that their mean serves for any place.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            Nodes, mm, left camera's axes.
+
+        Returns
+        -------
+        ndarray, shape (3, 3, M)
+        """
+        sampled = points[:: len(points) // _SAMPLED + 1]
+        length = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))  # any that is short against the distance
+        weights = np.eye(4)[None].repeat(len(sampled), axis=0)
+        steps = [np.zeros(3), *(length * self.rotation)]
+        rest, *moved = (triangulate(self.pair, *self.pair.project(sampled + step), weights) for step in steps)
+        return np.stack([self.displacement(rest, state).mean(axis=0) / length for state in moved], axis=1)
 
 
 def covariance_of(errors: FloatArray) -> FloatArray:

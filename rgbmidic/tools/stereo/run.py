@@ -25,15 +25,17 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.pipeline.source import Series, open_frames
-from rgbmidic.results import Result, frame_times
+from rgbmidic.results import Result, common_variance_fraction, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import carry_mesh
-from rgbmidic.tools.stereo.result import STEREO_FILE, StereoResult, write_stereo
+from rgbmidic.tools.stereo.left_result import LeftResult
+from rgbmidic.tools.stereo.result import StereoResult
 from rgbmidic.tools.stereo.shape import Shape, nodal_values
+from rgbmidic.tools.stereo.stereo_file import STEREO_FILE, write_stereo
 from rgbmidic.typing import AnyArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
@@ -50,6 +52,10 @@ class RunOptions(TypedDict, total=False):
     resume: bool
     workers: int | None
     progress: ProgressCallback | None
+
+
+class _PartOptions(RunOptions, total=False):
+    frames: range | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +107,8 @@ class _Test:
         result = None
         if not isinstance(test, TestSettings) and Path(test).is_dir():
             result = Result.open(test)
+            if isinstance(result, LeftResult):
+                raise InputError(f"{test} is a result of two cameras; the result of one is {result.left.path}")
             settings = TestSettings.from_mapping(result.provenance["settings"], result.provenance["base"])
         else:
             settings = test if isinstance(test, TestSettings) else read_test(test)
@@ -180,11 +188,94 @@ def measure_stereo(
         As `rgbmidic.measure`; or both tests contradict each other or the cameras.
     """
     out = Path(out)
-    pair = camera if isinstance(camera, CameraPair) else CameraPair.read(camera)
-    tests = _Test.open(left), _Test.open(right)
     file = out / STEREO_FILE
     if file.exists():
         check_file(file, overwrite=run.get("overwrite", False) or run.get("resume", False))
+    first, second, shape = _measure_cameras((left, right), camera, out, settings, run)
+    meshes = shape.carried_mesh
+    attributes = {
+        "axes": shape.axes.description,
+        "axes_origin_mm": shape.axes.origin,
+        "axes_rotation": shape.axes.rotation,
+        "gauge_px": shape.gauges.gauges.length,
+        "measure": settings.measure,
+        "relative_length_std": shape.calibration.length_std,
+        "calibration_gain": shape.calibration.mean_gain(shape.triangulation.points),
+        "common_variance_fraction": common_variance_fraction(first),
+        "left": _path_from(out, first.path),
+        "right": _path_from(out, second.path),
+        "calibration": json.dumps({"name": shape.pair.name, "parameters": shape.pair.parameters.tolist()}),
+    }
+
+    def frames() -> Iterator[dict[str, AnyArray]]:
+        for index in range(len(first)):
+            sides = nodal_values(first, index, meshes.nodes), nodal_values(second, index)
+            yield {
+                "number": sides[0]["number"],
+                "status": np.maximum(sides[0]["status"], sides[1]["status"]),
+                "reference": is_reference[index],
+                **shape.frame(*sides),
+            }
+
+    with write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    doubts, is_reference = list[str](), first.in_units().references
+    times = frame_times(first)
+    write_complete(
+        file,
+        lambda stream: doubts.extend(
+            write_stereo(stream, shape, names=first.names, times=times, frames=frames(), attributes=attributes)
+        ),
+    )
+    for text in doubts:
+        if text not in meshes.warnings:  # reported when it was found
+            logger.warning("%s", text)
+    return StereoResult.open(file)
+
+
+def measure_stereo_part(
+    left: TestSettings | Path | str,
+    right: TestSettings | Path | str,
+    camera: CameraPair | Path | str,
+    out: Path | str,
+    frames: range,
+    settings: StereoSettings = StereoSettings(),
+    *,
+    workers: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> None:
+    """Measure some frames of both cameras; other processes may measure others into the folder at the same time.
+
+    When all are measured, `measure_stereo` with ``resume`` triangulates them.
+
+    Parameters
+    ----------
+    left, right, camera, out, settings
+        As of `measure_stereo`.
+    frames
+        Indices of the frames, those that the settings choose.
+    workers, progress
+        As of `rgbmidic.measure`.
+
+    Raises
+    ------
+    RgbmidicError
+        As of `measure_stereo`.
+    """
+    options: _PartOptions = {"frames": frames, "workers": workers, "progress": progress}
+    _measure_cameras((left, right), camera, Path(out), settings, options)
+
+
+def _measure_cameras(
+    cameras: tuple[TestSettings | Path | str, TestSettings | Path | str],
+    camera: CameraPair | Path | str,
+    out: Path,
+    settings: StereoSettings,
+    run: _PartOptions,
+) -> tuple[Result, Result, Shape]:
+    """Measure both cameras' frames; return both results and the undeformed surface."""
+    pair = camera if isinstance(camera, CameraPair) else CameraPair.read(camera)
+    tests = _Test.open(cameras[0]), _Test.open(cameras[1])
     _check(pair, tests)
     _check_times(tests, settings.pairing)
     images = tests[0].reference(), tests[1].reference()
@@ -201,44 +292,21 @@ def measure_stereo(
     )
     shape = Shape.of(pair, mesh_pair, axes=settings.axes, gauge=settings.gauge, measure=settings.measure)
     second = _measure_right(tests[1], mesh_pair.right, mesh_pair.region, out / "right", run)
-    attributes = {
-        "axes": shape.axes.description,
-        "axes_origin_mm": shape.axes.origin,
-        "axes_rotation": shape.axes.rotation,
-        "gauge_px": shape.gauges.gauges.length,
-        "measure": settings.measure,
-        "relative_length_std": shape.calibration.length_std,
-        "left": str(first.path.resolve()),
-        "right": str(second.path.resolve()),
-        "calibration": json.dumps({"name": pair.name, "parameters": pair.parameters.tolist()}),
-    }
-
-    def frames() -> Iterator[dict[str, AnyArray]]:
-        for index in range(len(first)):
-            yield shape.frame(nodal_values(first, index, mesh_pair.nodes), nodal_values(second, index))
-
-    with write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    doubts = list[str]()
-    times = frame_times(first)
-    write_complete(
-        file,
-        lambda stream: doubts.extend(
-            write_stereo(stream, shape, names=first.names, times=times, frames=frames(), attributes=attributes)
-        ),
-    )
-    for text in doubts:
-        if text not in mesh_pair.warnings:  # reported when it was found
-            logger.warning("%s", text)
-    return StereoResult.open(file)
+    return first, second, shape
 
 
-def _resumable(out: Path, run: RunOptions) -> RunOptions:
+def _path_from(out: Path, path: Path) -> str:
+    """Return the path of a result as seen from the stereo result, where it lies in it: both may be moved together."""
+    path, out = path.resolve(), out.resolve()
+    return path.relative_to(out).as_posix() if path.is_relative_to(out) else str(path)
+
+
+def _resumable(out: Path, run: _PartOptions) -> _PartOptions:
     """Return the options of a run into a folder: one that has not begun is not resumed."""
     return {**run, "resume": run.get("resume", False) and is_result(out)}
 
 
-def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: RunOptions) -> Result:
+def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: _PartOptions) -> Result:
     """Measure the right test on the carried mesh; a result that was measured on it is taken as it is."""
     if test.result is not None and np.array_equal(test.result.nodes, mesh.nodes):
         return test.result

@@ -45,6 +45,8 @@ class StereoLimits:
 
 
 LIMITS = StereoLimits()
+MATCHED = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std", "node_status")
+"""Quantities of a camera's result that are triangulated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,16 +135,16 @@ class Shape:
         Parameters
         ----------
         left, right
-            ``u``, ``v``, ``u_std``, ``v_std`` and ``node_status`` of the N nodes of the carried mesh in either test.
+            `MATCHED` quantities of the N nodes of the carried mesh in either test.
 
         Returns
         -------
         dict
             Quantities of `rgbmidic.tools.stereo.result.QUANTITIES` that a frame has, by name.
         """
-        displacements, stds = (
+        displacements, stds, biases = (
             [np.stack([side[f"u{end}"], side[f"v{end}"]], axis=1, dtype=np.float64) for side in (left, right)]
-            for end in ("", "_std")
+            for end in ("", "_std", "_bias_std")
         )
         spread = _diagonal(*stds)
         weights = _weights(spread)
@@ -152,18 +154,25 @@ class Shape:
         reference = triangulate(self.pair, *nodes, spread, weights)
         displacement = (deformed.points - reference.points) @ self.axes.rotation.T
         covariance = self.axes.covariance(deformed.covariance)
+        gain = self.axes.rotation @ deformed.gain
+        bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
         errors = self.calibration.displacement(reference, deformed)
-        strain, normal = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
-        covariance = covariance + covariance_of(errors)
+        surface = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
+        strain, calibration_covariance = surface.strain, covariance_of(errors)
+        covariance = covariance + calibration_covariance
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
+            "calibration_covariance": calibration_covariance,
             "epipolar_change": deformed.residual - reference.residual,
             "epipolar_change_std": deformed.residual_std,
-            "normal": normal,
+            "normal": surface.normal,
+            "tilt": surface.tilt,
+            "tilt_std": surface.tilt_std,
             "left_status": np.asarray(left["node_status"]),
             "right_status": np.asarray(right["node_status"]),
         }
+        values |= dict(zip(("u_bias_std", "v_bias_std", "w_bias_std"), bias.T, strict=True))
         for column, name in enumerate("uvw"):
             values |= {name: displacement[:, column], f"{name}_std": std[:, column]}
         for name in ("exx", "eyy", "exy", "e1", "e2", "direction"):
@@ -210,8 +219,8 @@ class Shape:
 
 def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:
     """Read what `Shape.frame` needs of some nodes of a frame."""
-    values = result.frame(frame).values
-    return {name: np.asarray(values[name])[nodes] for name in ("u", "v", "u_std", "v_std", "node_status")}
+    values = next(result.table.iterate([*MATCHED, "number", "status"], [frame]))
+    return {name: values[name][nodes] if name in MATCHED else values[name] for name in values}
 
 
 def _weights(covariance: FloatArray) -> FloatArray:

@@ -1,22 +1,42 @@
-"""Surface strain in space: tangents of the undeformed and of the deformed surface over virtual strain gauges.
+"""Surface strain and attitude in space: virtual strain gauges on the undeformed and on the deformed surface.
 
-A gauge fits planes to the three coordinates of its nodes over the left frame (`rgbmidic.fields.StrainGauges`): the
-columns of A (3, 2) are the tangents of the undeformed surface, those of B of the deformed one. With the orthonormal
-axes T (3, 2) of the undeformed tangent plane and ``M = (T^T A)^-1`` the deformation gradient of the surface is
-``F = B M`` (3, 2), and ``E = (F^T F - I) / 2`` its Green-Lagrange strain in these axes. Turned into the deformed
-tangent plane by the polar decomposition ``F = Q U``, ``Q^T F`` is a gradient in the plane, of which
-`rgbmidic.fields.strain_of_gradient` takes strain and uncertainty.
+A gauge fits planes to the three coordinates of its nodes over the left frame (`rgbmidic.fields.StrainGauges`), whose
+slopes are the tangents of the surface (`rgbmidic.fields.tangent_plane`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rgbmidic.field import Displacement
 from rgbmidic.fields import NodalCovariance, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.strain import length_of
+from rgbmidic.fields.tangent_plane import gradient_errors, in_tangent_plane, measured_slopes, normals, tangent_axes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceStrain:
+    """Strain and attitude of a surface at G gauges; NaN where not measured.
+
+    Attributes
+    ----------
+    strain
+        In the tangent plane of the undeformed surface: its first axis is the projection of x, the second one that of y
+        made normal to it.
+    normal : ndarray, shape (G, 3)
+        Unit normal of the deformed surface, with a positive component along z.
+    tilt, tilt_std : ndarray, shape (G,)
+        Angle between the normals of the undeformed and of the deformed surface, and its standard uncertainty, degrees.
+    """
+
+    strain: Strain
+    normal: FloatArray
+    tilt: FloatArray
+    tilt_std: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,15 +46,12 @@ class SurfaceGauges:
     Attributes
     ----------
     gauges
-        On the mesh in px of the left frame.
-    points : ndarray, shape (N, 3)
-        The undeformed surface at the nodes, mm.
+        On the mesh in px of the left frame, with the undeformed surface in space.
     measure
         Strain measure, as of `rgbmidic.fields.strain_of`.
     """
 
     gauges: StrainGauges
-    points: FloatArray
     measure: str = "green-lagrange"
 
     @classmethod
@@ -58,13 +75,13 @@ class SurfaceGauges:
         -------
         SurfaceGauges
         """
-        gauges = StrainGauges.at_nodes(NodalCovariance.from_mesh(mesh), length)
-        return cls(gauges=gauges, points=points, measure=measure)
+        covariance = replace(NodalCovariance.from_mesh(mesh), surface=points)
+        return cls(gauges=StrainGauges.at_nodes(covariance, length), measure=measure)
 
     def strain(
         self, displacement: FloatArray, covariance: FloatArray, errors: tuple[FloatArray, FloatArray] | None = None
-    ) -> tuple[Strain, FloatArray]:
-        """Compute strain of the surface and the normal of the deformed one.
+    ) -> SurfaceStrain:
+        """Compute strain and attitude of the deformed surface.
 
         Parameters
         ----------
@@ -79,69 +96,32 @@ class SurfaceGauges:
 
         Returns
         -------
-        strain : Strain
-            In the tangent plane of the undeformed surface: its first axis is the projection of x, the second one that
-            of y made normal to it.
-        normal : ndarray, shape (N, 3)
-            Unit normal of the deformed surface, with a positive component along z.
+        SurfaceStrain
         """
-        gauges = self.gauges
-        measured = np.asarray(np.isfinite(displacement).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-        weights = gauges.weights(measured)
-        fields = np.where(measured[:, None], displacement, 0.0)
-        spread = np.where(measured[:, None, None], covariance, 0.0)
-
-        def total(values: FloatArray) -> FloatArray:
-            return np.asarray(np.add.reduceat(values, gauges.starts[:-1], axis=0))
-
-        def fit(nodal: FloatArray) -> FloatArray:
-            """Return the slopes (G, ..., 2) of fields (N, ...)."""
-            flat = nodal.reshape(len(nodal), -1)
-            sums = total(weights.T[:, None] * flat[gauges.nodes][..., None])
-            return sums.reshape(len(sums), *nodal.shape[1:], 2)
-
-        tangents, slopes = fit(self.points), fit(fields)  # (G, 3, 2)
-        products = weights[[0, 0, 1, 1]] * weights[[0, 1, 0, 1]]
-        inflation = gauges.inflation[:, [0, 2, 2, 1]]
-        sums = total(products.T[..., None, None] * spread[gauges.nodes][:, None]) * inflation[..., None, None]
-        # (G, 2, 2, 3, 3) -> of slopes row by row: (G, 3, 2, 3, 2)
-        of_slopes = sums.reshape(-1, 2, 2, 3, 3).transpose(0, 3, 1, 4, 2)
-
-        valid = np.asarray(np.isfinite(slopes + tangents).all(axis=(1, 2)))
-        flat = np.eye(3)[:, :2]
-        tangents, slopes = (np.where(valid[:, None, None], array, flat) for array in (tangents, slopes))
-        deformed = tangents + slopes
-        axes = _tangent_axes(tangents)
-        to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
-        gradient = deformed @ to_axes
-        left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
-        turn = (left_vectors @ right_vectors).transpose(0, 2, 1)  # Q^T
-        spread_in_plane = np.einsum(
-            "gai,gdb,gidje,gcj,gef->gabcf", turn, to_axes, of_slopes, turn, to_axes, optimize=True
+        std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+        field = Displacement(
+            unit="mm",
+            dims=("component", "node"),
+            values=displacement.T,
+            std=std.T,
+            covariance=np.moveaxis(covariance, 0, 2),
         )
-        in_plane = turn @ gradient - np.eye(2)
-        # by the calibration: dF = dB M + B dM with dM = -M (T^T dA) M
-        tangent_errors, slope_errors = (
-            np.moveaxis(fit(np.where(measured[:, None, None], nodal, 0.0)), 2, 0)
-            for nodal in errors or (np.zeros((len(fields), 3, 0)),) * 2
-        )  # (M, G, 3, 2)
-        of_gradient = tangent_errors + slope_errors - gradient @ (axes.transpose(0, 2, 1) @ tangent_errors)
-        together = turn @ (of_gradient @ to_axes)
-        spread_in_plane += np.einsum("mgac,mgbd->gacbd", together, together)
-        in_plane[~valid] = np.nan
-        spread_in_plane[~valid] = np.nan
-        normal = np.cross(deformed[:, :, 0], deformed[:, :, 1])
-        normal *= (np.where(normal[:, 2] < 0, -1, 1) / np.linalg.norm(normal, axis=1))[:, None]
+        slopes, of_slopes = self.gauges.slopes_of(field)
+        tangents = self.gauges.tangents(field.is_measured)
+        gradient, spread = in_tangent_plane(tangents, slopes, of_slopes)
+        if errors is not None:
+            of_shape, of_displacement = (np.moveaxis(self.gauges.fit(one, field.is_measured), 2, 0) for one in errors)
+            of_gradient = gradient_errors(tangents, slopes, of_shape, of_displacement)
+            spread = spread + np.einsum("mgi,mgj->gij", of_gradient, of_gradient)
+        strain = strain_of_gradient(gradient, spread, self.measure)
+        tangents, slopes, valid = measured_slopes(tangents, slopes)
+        axes, normal = tangent_axes(tangents), normals(tangents + slopes)
+        # to first order the normal turns by the slopes along it
+        to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
+        change = np.einsum("gi,gdf->gfid", normal, to_axes).reshape(-1, 2, 6)
+        of_tilt = change @ np.where(valid[:, None, None], of_slopes, 0) @ change.transpose(0, 2, 1)
+        sine, sine_std = length_of(np.einsum("gi,gia->ga", normal, axes), of_tilt)
+        arrays = np.degrees(np.arcsin(np.minimum(sine, 1))), np.degrees(sine_std)
         normal[~valid] = np.nan
-        return strain_of_gradient(in_plane, spread_in_plane.reshape(-1, 4, 4), self.measure), normal
-
-
-def _tangent_axes(tangents: FloatArray) -> FloatArray:
-    """Return orthonormal axes (G, 3, 2) of tangent planes: x projected onto each, and the normal to it in the plane."""
-    basis, _ = np.linalg.qr(tangents)
-    along = np.einsum("gia,ga->gi", basis, basis[:, 0])  # x projected
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-    normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal *= np.where(normal[:, 2:] < 0, -1, 1)
-    return np.stack([along, np.cross(normal, along)], axis=2)
+        tilt, tilt_std = (np.where(valid, array, np.nan) for array in arrays)
+        return SurfaceStrain(strain=strain, normal=normal, tilt=tilt, tilt_std=tilt_std)

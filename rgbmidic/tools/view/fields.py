@@ -353,7 +353,7 @@ class FieldsInView:
         if not isinstance(probe, Mean):
             return ""
         value, std = self._mean(field, probe)
-        limit_note = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
+        limit_note = " at most" if kind != "point" and name not in maps.physical.components and np.isfinite(std) else ""
         return f"{' mean' if kind != 'point' else ''}: {field.format(value, std)}{limit_note}"
 
     def _mean(self, field: ResultQuantity, mean: Mean) -> tuple[float, float]:

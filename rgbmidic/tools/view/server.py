@@ -30,8 +30,9 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
 from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
+from rgbmidic.extensions import RESULTS
 from rgbmidic.results import Maps, Result
-from rgbmidic.results.provenance import PROVENANCE
+from rgbmidic.results.provenance import PROVENANCE, find_marker
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.tools.report.page import render
 from rgbmidic.tools.view.constants import VIEWER
@@ -156,7 +157,7 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
     runs: list[Run] = []
 
     def make_page(source_path: Path) -> Callable[[Document], None]:
-        if (source_path / PROVENANCE).exists():
+        if find_marker(source_path):
             Result.open(source_path, partial=True, check=False)
             return partial(_fill_result, source_path, shared)
         DraftFrames(Draft.from_path(source_path, statement))
@@ -180,7 +181,7 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
             raise ResultError("no run was started yet")
         _fill_result(runs[-1].out, shared, document)
 
-    finished = (path / PROVENANCE).exists()
+    finished = find_marker(path) is not None
     several = not finished and path.is_dir() and any(_find_tests(path))
     if statement and (finished or several or path.suffix.lower() == ".toml"):
         description = "a result" if finished else "a folder of results and tests" if several else "a TEST.toml"
@@ -193,12 +194,12 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
 
 def _find_tests(folder: Path) -> dict[Path, float]:
     """Return the results and TEST.toml files in a folder and two levels below with the time of change, newest first."""
-    times: dict[Path, float] = {}
+    times, markers = dict[Path, float](), (PROVENANCE, *RESULTS)
     for pattern in ("", "*/", "*/*/"):
-        for file in (*folder.glob(f"{pattern}{PROVENANCE}"), *folder.glob(f"{pattern}*.toml")):
+        for file in (file for name in (*markers, "*.toml") for file in folder.glob(f"{pattern}{name}")):
             try:
-                if file.name == PROVENANCE or "path" in read_table(read_toml(file, "settings file"), "frames"):
-                    times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
+                if file.name in markers or "path" in read_table(read_toml(file, "settings file"), "frames"):
+                    times[file.parent if file.name in markers else file] = file.stat().st_mtime
             except (ConfigurationError, OSError):  # of another program, or gone by now
                 continue
     return dict(sorted(times.items(), key=lambda item: item[1], reverse=True)[: VIEWER.max_listed_tests])

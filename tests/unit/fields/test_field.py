@@ -81,3 +81,20 @@ def test_arrays_go_together() -> None:
     np.testing.assert_allclose(in_mm.uncertainty, np.hypot(0.1, 0.01 * np.arange(4)))
     np.testing.assert_allclose(in_mm.bias, 0.05)  # type: ignore[arg-type]
     assert Units(mm_per_pixel=0.1).convert(replace(field, unit="deg")).unit == "deg"
+
+
+def test_covariances_that_turn_from_node_to_node_are_those_of_neighbours_too() -> None:
+    """Eigenvectors of neighbouring nodes may point to opposite sides; their errors do not."""
+    angle = np.radians(1.5) * MESH.nodes[:, 0]
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(COUNT)
+    turned = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])
+    root = np.einsum("ian,ab,jbn->ijn", turned, np.diag([1.0, 2.0, 5.0]) * 1e-3, turned)
+    covariance = np.einsum("ikn,jkn->ijn", root, root)
+    independent = np.random.default_rng(1).normal(size=(500, FLAT.fit.shape[1], 3))
+    values = np.einsum("ikn,nr,trk->itn", root, FLAT.fit.toarray(), independent, optimize=True)
+    std = np.sqrt(np.einsum("iin->in", covariance))[:, None]
+    probe = make_probe(IN_SPACE, "region", 1, (20, 20, 100, 70))
+    stacked = np.broadcast_to(covariance[:, :, None], (3, 3, 500, COUNT))
+    noisy = Displacement(unit="mm", values=values, std=np.broadcast_to(std, values.shape), covariance=stacked)
+    for history in probe.histories(noisy.isel(node=probe.nodes))[:6]:  # u, v, w and the strain of the surface
+        assert history.values.std() == pytest.approx(np.median(history.uncertainty), rel=0.1), history.name

@@ -13,6 +13,7 @@ from stereo_scene import DISTANCE, MOTIONS, SHAPE, Motion, image, pair_of, write
 from rgbmidic import Region, Result, Tri3Mesh
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.illumination import IlluminationImages
+from rgbmidic.results import export_result
 from rgbmidic.tools.stereo import (
     QUANTITIES,
     CarriedMesh,
@@ -21,6 +22,8 @@ from rgbmidic.tools.stereo import (
     StereoSettings,
     carry_mesh,
     measure_stereo,
+    measure_stereo_part,
+    open_left,
 )
 
 
@@ -96,17 +99,20 @@ def test_the_file_is_read_by_others(measured, tmp_path):
     dataset = result.to_xarray()
     assert dataset.w.dims == ("time", "node")
     assert dataset.w.attrs["units"] == "mm"
-    result.write_csv(tmp_path)
-    lines = (tmp_path / "000002.csv").read_text().splitlines()
-    assert len(lines) == nodes + 1
-    assert lines[0].startswith("node,x_left_px,")
-    assert "w_mm" in lines[0].split(",")
+    tables = {to: tmp_path / f"all.{to}" for to in ("csv", "npz", "hdf5")}
+    for to, path in tables.items():
+        export_result(open_left(result.path), to, path)
     with pytest.raises(ResultError, match="already exists"):
-        result.write_csv(tmp_path)
-    assert result.figure("w", 1).axes
-    assert result.figure("z").axes
-    with pytest.raises(InputError, match="no map of 'normal'"):
-        result.figure("normal")
+        export_result(open_left(result.path), "csv", tables["csv"])
+    lines = tables["csv"].read_text().splitlines()
+    assert len(lines) == 3 * nodes + 1
+    head = lines[0].split(",")
+    assert head[:6] == ["frame", "number", "name", "status", "node", "x_left_px"]
+    row = dict(zip(head, lines[-1].split(","), strict=True))
+    assert (row["frame"], row["node"]) == ("2", str(nodes - 1))
+    assert float(row["w_mm"]) == pytest.approx(result["w"][2, -1], rel=1e-6)
+    assert np.array_equal(np.load(tables["npz"])["displacement_covariance"], result["displacement_covariance"])
+    assert tables["hdf5"].read_bytes() == result.path.read_bytes()
     with pytest.raises(InputError, match="it has "):
         result["strain"]
     assert set(QUANTITIES) <= set(dataset.variables)
@@ -223,13 +229,22 @@ def test_other_lights_are_refused(pair):
         carry_mesh((first[0], second[0]), mesh)
 
 
-def test_a_run_that_stopped_before_the_right_camera_goes_on(measured, pair, tmp_path):
+def test_a_run_in_parts_that_stopped_before_the_right_camera_goes_on(measured, pair, tmp_path):
     folder, result = measured
-    (tmp_path / "result").mkdir()
-    shutil.copytree(folder / "result/left", tmp_path / "result/left")
+    out, settings = tmp_path / "result", StereoSettings(axes="camera")
+    out.mkdir()
+    shutil.copytree(folder / "result/left", out / "left")
     tests = folder / "left/TEST.toml", folder / "right/TEST.toml"
-    again = measure_stereo(*tests, pair, tmp_path / "result", StereoSettings(axes="camera"), resume=True, workers=1)
-    assert np.array_equal(again["w"], result["w"], equal_nan=True)
+    for part in (range(2), range(2, 3)):
+        measure_stereo_part(*tests, pair, out, part, settings, workers=1)
+        assert not (out / "stereo.vtkhdf").exists()
+    measure_stereo(*tests, pair, out, settings, resume=True, workers=1)
+    moved = out.rename(tmp_path / "moved")
+    assert np.array_equal(StereoResult.open(moved)["w"], result["w"], equal_nan=True)
+    assert len(StereoResult.open(moved).camera("right").nodes) == len(result["x"])
+    shutil.rmtree(moved / "left")
+    with pytest.raises(ResultError, match=r"the result of the left camera, .* is not there any more"):
+        open_left(moved)
 
 
 def test_a_node_that_is_matched_wrongly_is_reported(measured, pair):

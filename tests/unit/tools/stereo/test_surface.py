@@ -21,9 +21,16 @@ def strain_of(motion, points=REST, covariance=EXACT, **changes):
     return gauges.strain(motion.points(MATERIAL) - REST, covariance)
 
 
+def tilt_of(motion):
+    """Angle in degrees by which a motion turns the plate's normal."""
+    return np.degrees(np.arccos(motion.attitude[:, 2] @ Motion().attitude[:, 2]))
+
+
 def test_a_rigid_motion_strains_nothing():
-    strain, _ = strain_of(Motion(degrees=(20.0, -35.0, 50.0), translation=(3.0, 2.0, -9.0)))
-    assert np.abs(strain.components).max() < 1e-12
+    motion = Motion(degrees=(20.0, -35.0, 50.0), translation=(3.0, 2.0, -9.0))
+    surface = strain_of(motion)
+    assert np.abs(surface.strain.components).max() < 1e-12
+    assert surface.tilt == pytest.approx(tilt_of(motion), abs=1e-6)
 
 
 @pytest.mark.parametrize("measure", ["green-lagrange", "biot"])
@@ -33,7 +40,8 @@ def test_a_stretch_of_a_plate_that_turns_is_exact(measure):
     axes = Axes.of("plane", MESH, REST)
     motion = Motion(stretch=tuple(map(tuple, stretch)), degrees=(5.0, 9.0, -20.0))
     gauges = SurfaceGauges.around_nodes(MESH, axes.points(REST), measure=measure)
-    strain, normal = gauges.strain((motion.points(MATERIAL) - REST) @ axes.rotation.T, EXACT)
+    surface = gauges.strain((motion.points(MATERIAL) - REST) @ axes.rotation.T, EXACT)
+    strain, normal = surface.strain, surface.normal
     along = axes.rotation @ Motion().attitude[:, :2]  # the material's axes in those of the result
     c = along[:2] @ (stretch.T @ stretch) @ along[:2].T
     values, vectors = np.linalg.eigh(c)
@@ -43,7 +51,8 @@ def test_a_stretch_of_a_plate_that_turns_is_exact(measure):
 
 
 def test_noise_of_nodes_that_are_correlated_as_those_of_a_fit_is_stated():
-    random, ratios = np.random.default_rng(0), []
+    random, ratios, tilts = np.random.default_rng(0), [], []
+    motion = Motion(degrees=(1, 2, 3))
     gauges = SurfaceGauges.around_nodes(MESH, REST, 70.0)
     from rgbmidic.fields import NodalCovariance
 
@@ -52,8 +61,10 @@ def test_noise_of_nodes_that_are_correlated_as_those_of_a_fit_is_stated():
     covariance = np.tile(root @ root.T, (len(REST), 1, 1))
     for _ in range(60):
         noise = fit @ random.normal(size=(fit.shape[1], 3)) @ root.T
-        strain, _ = gauges.strain(Motion(degrees=(1, 2, 3)).points(MATERIAL) - REST + noise, covariance)
-        ratios.append(strain.components / strain.components_std)
+        surface = gauges.strain(motion.points(MATERIAL) - REST + noise, covariance)
+        ratios.append(surface.strain.components / surface.strain.components_std)
+        tilts.append((surface.tilt - tilt_of(motion)) / surface.tilt_std)
+    assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(1, abs=0.1)
     assert np.sqrt(np.mean(np.square(ratios), axis=(0, 1))) == pytest.approx(1, abs=0.1)
 
 
@@ -61,10 +72,11 @@ def test_a_node_without_data_leaves_its_gauge_without():
     gauges = SurfaceGauges.around_nodes(MESH, REST)
     displacement = np.zeros_like(REST)
     displacement[10] = np.nan
-    strain, normal = gauges.strain(displacement, EXACT)
-    assert np.isnan(strain.components[10]).all()
-    assert np.isnan(normal[10]).all()
-    assert np.isfinite(strain.components).any()
+    surface = gauges.strain(displacement, EXACT)
+    assert np.isnan(surface.strain.components[10]).all()
+    assert np.isnan(surface.normal[10]).all()
+    assert np.isnan(surface.tilt[10])
+    assert np.isfinite(surface.strain.components).any()
 
 
 def test_axes():

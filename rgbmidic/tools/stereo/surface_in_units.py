@@ -1,0 +1,241 @@
+"""The surface in space as what reads fields of a result takes it (`rgbmidic.field.FieldSource`): mm and s.
+
+Probes and lines are placed in px of the left reference; lengths along them, displacements and strains are those in
+space.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, BinaryIO, ClassVar, Self
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.field import Displacement, Field
+from rgbmidic.fields import NodalCovariance, Rectification, StrainGauges, Units
+from rgbmidic.fields.strain import STRAIN
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results import ResultQuantity
+from rgbmidic.results.quantities import derived_quantities, stored_map_quantities
+from rgbmidic.results.result_in_units import ResultInUnits
+from rgbmidic.settings import ScaleSettings
+from rgbmidic.tools.stereo.stereo_file import QUANTITIES
+from rgbmidic.typing import AnyArray, FloatArray
+
+if TYPE_CHECKING:
+    from rgbmidic.tools.stereo.left_result import LeftResult
+
+
+_SPACE = {
+    **dict.fromkeys(("x", "y", "z"), "displacement"),
+    "tilt": "strain",
+    "epipolar_common": "displacement",
+    "epipolar_change": "displacement",
+}
+"""Quantities of the file, with their standard uncertainty, that maps show as they are, with their kinds."""
+_COMPONENT = re.compile(r"(.+_)([uvw])((?:_velocity|_acceleration)?(?:_before|_after)?)")
+"""Name of a component of a vector that a probe measures: probe, component, rate."""
+_ROUNDING = 1e-6
+"""Part of a variance that is left at least where the calibration's is taken off it: single precision (derived)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceInUnits(ResultInUnits):
+    """A stereo result as histories, profiles, maps, figures, movies and reports read one.
+
+    Attributes
+    ----------
+    result
+        The left camera's result on the nodes that were carried over.
+    """
+
+    result: LeftResult
+    is_calibrated: ClassVar[bool] = True
+    components: ClassVar[tuple[str, ...]] = ("u", "v", "w")
+
+    @classmethod
+    def of(cls, result: LeftResult, scale: ScaleSettings | None = None) -> Self:
+        """Take the times of the left result, or of another ``[scale]``.
+
+        Parameters
+        ----------
+        result
+            The left result.
+        scale
+            It replaces the ``[scale]`` of the left test; None: that one.
+
+        Returns
+        -------
+        SurfaceInUnits
+
+        Raises
+        ------
+        InputError
+            Lengths in px are asked for.
+        """
+        if scale is not None and scale.unit == "px":
+            raise InputError(
+                f"lengths of {result.path} are those in space, mm; for px read the result of a camera, "
+                f"{result.left.path}"
+            )
+        mesh, points = Tri3Mesh(nodes=result.nodes, elements=result.elements), _points(result)
+        corners = points[mesh.elements]
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        mean_scale = float(np.sqrt(areas.sum() / mesh.areas.sum()))
+        relative = float(result.stereo.attributes["relative_length_std"])
+        units = Units(mm_per_pixel=mean_scale, mm_per_pixel_std=mean_scale * relative)
+        flat = Rectification(camera=None, image=mesh, mesh=mesh, units=units)
+        times = np.arange(len(result), dtype=np.float64)
+        return cls(result=result, scale=scale, units=units, times=times, rectified=flat)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Nodes (N, 3) on the undeformed surface, mm."""
+        return _points(self.result)
+
+    @cached_property
+    def covariance(self) -> NodalCovariance:
+        """Covariance of the nodes' errors, with the surface in space."""
+        return replace(NodalCovariance.from_mesh(self.mesh), surface=self.points)
+
+    @cached_property
+    def gauges(self) -> StrainGauges:
+        """Virtual strain gauges around the nodes; where no length is stated, with that of the file."""
+        return StrainGauges.at_nodes(self.covariance, self.gauge or float(self.result.stereo.attributes["gauge_px"]))
+
+    @property
+    def axes(self) -> tuple[str, float]:
+        """Pictures are those of the left camera: in px."""
+        return "px", 1.0
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """What a reader should know of lengths, a line each."""
+        attributes = self.result.stereo.attributes
+        yield f"u, v, w are along the axes {attributes['axes']}; lengths are those in space"
+        yield f"the calibration leaves {100 * float(attributes['relative_length_std']):.2g} % of every length"
+
+    @cached_property
+    def quantities(self) -> dict[str, ResultQuantity]:
+        """Every nodal field by its name: of the surface, and what the left camera's result has of its match."""
+        derived = derived_quantities(self.components)
+        # px are of the frames here: no length on the surface, which readers turn them into
+        space = [replace(QUANTITIES[name], symbol=name, kind=kind) for name, kind in _SPACE.items()]
+        errors = [QUANTITIES[f"{name}_std"] for name in _SPACE]
+        space = [replace(entry, unit=entry.unit.replace("px", "pixel")) for entry in (*space, *errors)]
+        left = stored_map_quantities(self.result.lights, with_error=False)
+        left = [entry for entry in left if not entry.name.startswith(("u_", "v_", "nodal_"))]
+        entries = [*(derived[name].with_units(self.units) for name in self.components), *STRAIN.values()]
+        return {entry.name: entry for entry in (*entries, *left, *space)}
+
+    def displacement(self, frame: int) -> Displacement:
+        """Read the displacement of all nodes in a frame, mm, without the part of the calibration in its uncertainty."""
+        values, total, of_calibration, bias = self._read(frame)
+        covariance = total - of_calibration
+        std = np.sqrt(np.maximum(np.einsum("nii->in", covariance), _ROUNDING * np.einsum("nii->in", total)))
+        return Displacement(
+            unit="mm",
+            dims=("component", "node"),
+            values=values.T,
+            std=std,
+            bias=np.minimum(bias.T, std),
+            covariance=np.moveaxis(covariance, 0, 2),
+        )
+
+    def field(self, name: str, frame: int) -> Field:
+        """Read one of the `quantities` with its standard uncertainty in a frame."""
+        base = name.removesuffix("_std")
+        if base in _SPACE:
+            entry, stereo = self.quantities[name], self.result.stereo
+            arrays = [np.asarray(stereo.at(one, frame), dtype=np.float64) for one in (name, f"{base}_std")]
+            std = arrays[1] if name == base else None
+            return Field(name=name, unit=entry.unit, dims=("node",), values=arrays[0], std=std)
+        if name in self.components:
+            by_name = {one.name: one for one in self.displacement(frame).components}
+            return self.calibrated(by_name[name], by_name, (name,))
+        return super().field(name, frame)
+
+    def frame(self, index: int) -> dict[str, AnyArray]:
+        """Return displacement, strain, and what the left camera's record has of the match, each in its type."""
+        record, displacement = self.result.frame(index).values, self.displacement(index)
+        columns = {name: np.asarray(record[name]) for name in ("number", "status", "node_status", "misfit")}
+        fields = [self.field(name, index) for name in self.components]
+        for field in (*fields, *self.gauges.strain(displacement, self.measure).values()):
+            columns |= {field.name: field.values, f"{field.name}_std": field.uncertainty}
+        return columns
+
+    @property
+    def exporter(self) -> Callable[[str, BinaryIO], None]:
+        """The file of the result has all that is exported."""
+        return self.result.stereo.export
+
+    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
+        """Add what the calibration leaves in a displacement or its rate, all places of which have it in common.
+
+        Parameters
+        ----------
+        field
+            Component, or length, of a vector.
+        vector
+            All components of the vector, by name, of the same shape.
+        names
+            Components that the field is the length of.
+
+        Returns
+        -------
+        Field
+        """
+        values = np.stack([vector[name].values for name in self.components])
+        weights = np.zeros_like(values)
+        for row in map(self.components.index, names):
+            weights[row] = 1.0 if len(names) == 1 else values[row] / np.maximum(field.values, np.finfo(float).tiny)
+        common = np.linalg.norm(np.einsum("ijk,i...,j...->k...", self._gain, weights, values), axis=0)
+        bias = None if field.bias is None else np.hypot(field.bias, common)
+        return replace(field, std=np.hypot(field.uncertainty, common), bias=bias)
+
+    def with_calibration(self, histories: Sequence[Field]) -> tuple[Field, ...]:
+        """Add what the calibration leaves in what probes measure.
+
+        Parameters
+        ----------
+        histories
+            Of all probes.
+
+        Returns
+        -------
+        tuple of Field
+        """
+        by_name = {history.name: history for history in histories}
+        return tuple(self._with_calibration(history, by_name) for history in histories)
+
+    def _with_calibration(self, history: Field, by_name: Mapping[str, Field]) -> Field:
+        if (match := _COMPONENT.fullmatch(history.name)) is not None:
+            vector = {name: by_name.get(f"{match[1]}{name}{match[3]}") for name in self.components}
+            known = {name: field for name, field in vector.items() if field is not None}
+            if len(known) == len(vector):
+                return self.calibrated(history, known, (match[2],))
+        if not history.unit.startswith("mm"):
+            return history
+        relative = float(self.result.stereo.attributes["relative_length_std"])
+        return replace(history, std=np.hypot(history.uncertainty, relative * history.values))
+
+    @property
+    def _gain(self) -> FloatArray:
+        return np.asarray(self.result.stereo.attributes["calibration_gain"], dtype=np.float64)
+
+    def _read(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Read the displacement (N, 3), its covariance (N, 3, 3), the calibration's part, the lights' bias (N, 3)."""
+        biases = [f"{name}_bias_std" for name in self.components]
+        covariances = ["displacement_covariance", "calibration_covariance"]
+        arrays = self.result.stereo.frame([*self.components, *covariances, *biases], frame)
+        values, bias = (np.stack([arrays[name] for name in names], axis=1) for names in (self.components, biases))
+        total, of_calibration = (np.asarray(arrays[name], dtype=np.float64) for name in covariances)
+        return values, total, of_calibration, bias.astype(np.float64)
+
+
+def _points(result: LeftResult) -> FloatArray:
+    return np.stack([result.stereo[name] for name in "xyz"], axis=1)
