@@ -21,6 +21,7 @@ def frame_of(shape, rest, deformed):
         {
             **{name: (after - before)[:, column] for column, name in enumerate("uv")},
             **{f"{name}_std": np.full(len(before), 1e-9) for name in "uv"},
+            **{f"{name}_bias_std": np.zeros(len(before)) for name in "uv"},
             "node_status": np.zeros(len(before), dtype=np.uint8),
         }
         for before, after in zip(rest, deformed, strict=True)
