@@ -431,8 +431,8 @@ class RigidMotion:
         by_sums[count:, :, 1:] = np.einsum("kl,lij->kij", np.linalg.pinv(normal), axes)
         weights = np.zeros((1 + count, len(nodes)))
         weights[:, is_measured] = np.vstack([np.full(len(arm), 1 / len(arm)), turned.T])
-        by_sums = by_sums.reshape(count + len(axes), -1)
-        std = np.sqrt(np.einsum("ka,ab,kb->k", by_sums, covariance.of_sums(weights, displacement), by_sums))
+        flat = by_sums.reshape(count + len(axes), -1)
+        std = np.sqrt(np.einsum("ka,ab,kb->k", flat, covariance.of_sums(weights, displacement), flat))
         rotation = Rotation.from_matrix(back.T).as_rotvec() if count == 3 else np.arctan2(back[0, 1], back[0, 0])
         return cls(
             centre=centre,

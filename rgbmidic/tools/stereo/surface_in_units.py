@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, BinaryIO, ClassVar, Self
+from typing import TYPE_CHECKING, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from rgbmidic.tools.stereo.left_result import LeftResult
 
 
-_SPACE = {
-    **dict.fromkeys(("x", "y", "z"), "displacement"),
+_SPACE: dict[str, Literal["displacement", "strain"]] = {
+    "x": "displacement",
+    "y": "displacement",
+    "z": "displacement",
     "tilt": "strain",
     "epipolar_common": "displacement",
     "epipolar_change": "displacement",
