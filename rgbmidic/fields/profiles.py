@@ -263,8 +263,8 @@ class Arrivals:
 
     Attributes
     ----------
-    times, std : ndarray, shape (P,)
-        In the unit of the frames' times, with their standard uncertainty; NaN where nothing arrives.
+    times
+        In the unit of the frames' times, with their standard uncertainty, shape (P,); NaN where nothing arrives.
     weights : ndarray, shape (P, T)
         Change of each arrival time by the value in each frame.
     abrupt
@@ -274,8 +274,7 @@ class Arrivals:
         Where the series still rises in the last frames: no peak, and no front that is a fraction of it, arrives.
     """
 
-    times: FloatArray
-    std: FloatArray
+    times: Field
     weights: FloatArray
     abrupt: bool
     cut: BoolArray
@@ -283,8 +282,7 @@ class Arrivals:
 
 def arrival_times(
     times: npt.ArrayLike,
-    values: npt.ArrayLike,
-    std: npt.ArrayLike,
+    field: Field,
     *,
     feature: str = ARRIVALS[0],
     level: float | str = "50%",
@@ -301,8 +299,8 @@ def arrival_times(
     ----------
     times : (T,)
         Of the frames, rising.
-    values, std : (T, P)
-        At each position, with their standard uncertainty; NaN where not measured.
+    field
+        At each position, with its standard uncertainty, shape (T, P); NaN where not measured.
     feature
         One of `ARRIVALS`.
     level
@@ -326,7 +324,7 @@ def arrival_times(
     value, fraction = read_level(level)
     if feature not in ARRIVALS:
         raise InputError(f"what arrives is {' or '.join(ARRIVALS)}, not {feature!r}")
-    frame_times, y, spread = (np.asarray(array, dtype=np.float64) for array in (times, values, std))
+    frame_times, y, spread = (np.asarray(array, dtype=np.float64) for array in (times, field.values, field.uncertainty))
     if len(frame_times) < 6 or not (np.diff(frame_times) > 0).all():
         raise InputError(f"arrival times need 6 frames or more whose times rise; there are {len(frame_times)}")
     interval = float(np.median(np.diff(frame_times)))
@@ -356,7 +354,8 @@ def arrival_times(
             noise = (1 - common_fraction) * weighted_std @ noise_correlation @ weighted_std
             noise += common_fraction * weighted_std.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
-    return Arrivals(times=arrivals, std=errors, weights=sign * weights, abrupt=abrupt, cut=cut)
+    found = Field(name="arrival", dims=("position",), values=arrivals, std=errors)
+    return Arrivals(times=found, weights=sign * weights, abrupt=abrupt, cut=cut)
 
 
 def read_level(level: float | str) -> tuple[float, float]:
@@ -533,7 +532,7 @@ class Front:
 def fit_front(
     positions: FloatArray,
     arrivals: Arrivals,
-    std: FloatArray,
+    field: Field,
     correlation: FloatArray,
     *,
     usable: BoolArray | None = None,
@@ -548,8 +547,8 @@ def fit_front(
         Along the line, rising.
     arrivals
         At these.
-    std : ndarray, shape (T, P)
-        Standard uncertainty of the values.
+    field
+        As of `arrival_times`, shape (T, P).
     correlation : ndarray, shape (P, P)
         Of the noise between positions.
     usable : ndarray, shape (P,), bool, optional
@@ -563,7 +562,7 @@ def fit_front(
         Something arrives at fewer than four positions that are far enough apart, or at all of them at once: no front
         travels along the line.
     """
-    arrival_indices = np.flatnonzero(np.isfinite(arrivals.times) & (True if usable is None else usable))
+    arrival_indices = np.flatnonzero(np.isfinite(arrivals.times.values) & (True if usable is None else usable))
     fitted = list[int]()
     for p in arrival_indices:
         if not fitted or abs(correlation[p, fitted[-1]]) <= _CONSTANTS.independent:
@@ -576,7 +575,7 @@ def fit_front(
             f"them far enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
             f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames{rising if cut else ''}"
         )
-    weighted_std = arrivals.weights[fitted] * np.nan_to_num(std.T[fitted])
+    weighted_std = arrivals.weights[fitted] * np.nan_to_num(field.uncertainty.T[fitted])
     noise_covariance = (
         weighted_std @ weighted_std.T if between_frames is None else weighted_std @ between_frames @ weighted_std.T
     )
@@ -584,12 +583,14 @@ def fit_front(
     cover = correlation[np.ix_(fitted, fitted)] * (
         (1 - common_fraction) * noise_covariance + common_fraction * np.outer(sums, sums)
     )
-    cover += np.diag(np.maximum(arrivals.std[fitted] ** 2 - np.diag(cover), 0))  # what is not noise, between two frames
+    cover += np.diag(
+        np.maximum(arrivals.times.uncertainty[fitted] ** 2 - np.diag(cover), 0)
+    )  # what is not noise, between two frames
     design = np.stack([np.ones(len(fitted)), positions[fitted]], axis=1)
     weighted = np.linalg.solve(cover, design)
     spread = np.linalg.inv(design.T @ weighted)
-    start, slope = spread @ (weighted.T @ arrivals.times[fitted])
-    residuals = arrivals.times - start - slope * positions
+    start, slope = spread @ (weighted.T @ arrivals.times.values[fitted])
+    residuals = arrivals.times.values - start - slope * positions
     chi_square, freedom = float(residuals[fitted] @ np.linalg.solve(cover, residuals[fitted])), len(fitted) - 2
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)

@@ -203,9 +203,9 @@ class Profile:
             "common_fraction": 0.0 if self.rate_window else self.common_fraction,
             "between_frames": frame_correlation,
         }
-        arrivals = arrival_times(clock, self.values, self.std, feature=feature, level=level, **options)
+        arrivals = arrival_times(clock, self.data, feature=feature, level=level, **options)
         correlation = self.line.correlation(self.covariance_key, float(self.bias_fractions.mean()))
-        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.is_two_sided, **options)
+        front = fit_front(self.positions, arrivals, self.data, correlation, usable=self.line.is_two_sided, **options)
         scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
         front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))
         return Wave(feature=feature, level=level, arrivals=arrivals, front=front)
@@ -300,8 +300,8 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     clock = "s" if time_columns else "frame"
     columns = {
         **dict(zip(head, positions.T, strict=True)),
-        f"arrival_{clock}": wave.arrivals.times,
-        f"arrival_{clock}_std": wave.arrivals.std,
+        f"arrival_{clock}": wave.arrivals.times.values,
+        f"arrival_{clock}_std": wave.arrivals.times.uncertainty,
         f"residual_{clock}": wave.front.residuals,
         "used": wave.front.is_fitted.astype(float),
     }

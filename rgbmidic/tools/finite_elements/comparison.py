@@ -25,7 +25,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Displacement, MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields import Displacement, Field, MeshPoints, NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
@@ -122,8 +122,8 @@ class FrameComparison:
         Index in the result.
     time
         Of the frame, on the simulation's clock.
-    measured, std : mapping of str to ndarray, shape (M,)
-        `COMPARED_QUANTITIES` and their standard uncertainty; NaN where a node has no data.
+    measured : mapping of str to Field, shape (M,)
+        `COMPARED_QUANTITIES` with their standard uncertainty; NaN where a node has no data.
     simulated : mapping of str to mapping
         The same of the simulation, in each of the `VARIANTS`.
     agreement : mapping of (str, str) to Agreement
@@ -134,19 +134,18 @@ class FrameComparison:
 
     frame: int
     time: float
-    measured: Mapping[str, FloatArray]
-    std: Mapping[str, FloatArray]
+    measured: Mapping[str, Field]
     simulated: Mapping[str, Mapping[str, FloatArray]]
     agreement: Mapping[tuple[str, str], Agreement]
     fit: Fit
 
     def difference(self, variant: str, name: str) -> FloatArray:
         """Return measured minus simulated (M,)."""
-        return np.asarray(self.measured[name] - self.simulated[variant][name])
+        return np.asarray(self.measured[name].values - self.simulated[variant][name])
 
     def ratio(self, variant: str, name: str) -> FloatArray:
         """Return the difference over its standard uncertainty (M,)."""
-        return np.asarray(self.difference(variant, name) / self.std[name])
+        return np.asarray(self.difference(variant, name) / self.measured[name].uncertainty)
 
 
 @state_new_names
@@ -279,8 +278,10 @@ class Comparison:
         return FrameComparison(
             frame=index,
             time=time,
-            measured=dict(zip(COMPARED_QUANTITIES, values, strict=True)),
-            std=dict(zip(COMPARED_QUANTITIES, std, strict=True)),
+            measured={
+                name: Field(name=name, dims=("node",), values=row, std=error)
+                for name, row, error in zip(COMPARED_QUANTITIES, values, std, strict=True)
+            },
             simulated={
                 variant: dict(zip(COMPARED_QUANTITIES, rows, strict=True)) for variant, (rows, _) in variants.items()
             },

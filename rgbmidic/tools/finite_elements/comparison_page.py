@@ -109,7 +109,7 @@ def write_comparison(
         frame_comparisons.append(
             frame_comparison
             if frame_comparison.frame in map_frames
-            else replace(frame_comparison, measured={}, std={}, simulated={})
+            else replace(frame_comparison, measured={}, simulated={})
         )
         number, clock = (
             int(comparison.result.number[frame_comparison.frame]),
@@ -152,8 +152,8 @@ def _write_state(comparison: Comparison, frame_comparison: FrameComparison, path
 
     fields: dict[str, Any] = {"node_number": mesh.node_numbers}
     for group in _GROUPS:
-        fields[group] = vectors(group, frame_comparison.measured.__getitem__)
-        fields[f"{group}_std"] = vectors(group, frame_comparison.std.__getitem__)
+        fields[group] = vectors(group, lambda name: frame_comparison.measured[name].values)
+        fields[f"{group}_std"] = vectors(group, lambda name: frame_comparison.measured[name].uncertainty)
         for variant in VARIANTS:
             fields[f"{group}_simulated_{variant}"] = vectors(group, frame_comparison.simulated[variant].__getitem__)
             fields[f"{group}_ratio_{variant}"] = vectors(group, partial(frame_comparison.ratio, variant))
@@ -196,7 +196,7 @@ def difference_figure(
             values, unit, reach = frame_comparison.ratio(variant, name), " in uncertainties", _LIMITS.colour_reach
             if not ratio:
                 values, unit = frame_comparison.difference(variant, name), "" if name[0] == "e" else " (mm)"
-                colour_values = style.ordinary_values(values, frame_comparison.std[name])
+                colour_values = style.ordinary_values(values, frame_comparison.measured[name].uncertainty)
                 reach = max(np.abs(style.colour_range(colour_values))) if colour_values.size else 1.0
             norm, finite = Normalize(-reach, reach), np.isfinite(values)
             has_data = finite[mesh.elements].all(axis=1)

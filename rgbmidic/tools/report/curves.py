@@ -333,8 +333,8 @@ def profile_figure(profile: Profile, wave: Wave | None = None, curve_rows: Seque
         map_axis.set_title(field)
         if wave is not None:
             used_positions = wave.front.is_fitted
-            points = factor * wave.arrivals.times[used_positions], profile.positions[used_positions]
-            bars = 2 * factor * wave.arrivals.std[used_positions]
+            points = factor * wave.arrivals.times.values[used_positions], profile.positions[used_positions]
+            bars = 2 * factor * wave.arrivals.times.uncertainty[used_positions]
             map_axis.errorbar(
                 *points, xerr=bars, fmt="o", ms=2.5, color="w", mec="k", mew=0.5, ecolor="k", elinewidth=0.8
             )

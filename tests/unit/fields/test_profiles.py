@@ -33,6 +33,10 @@ def nodal(values: np.ndarray, std: np.ndarray) -> Field:
     return Field(name="u", dims=("node",), values=values, std=std)
 
 
+def series(values: np.ndarray, std: np.ndarray) -> Field:
+    return Field(name="u", dims=("frame", "position"), values=values, std=std)
+
+
 def along(field: str, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The field u or exx and its uncertainty along the line, (T, P)."""
     std, nothing, read = np.full(len(MESH.nodes), noise * np.sqrt(2)), np.zeros(len(MESH.nodes)), []
@@ -78,8 +82,8 @@ def test_the_speed_of_a_pulse_lies_within_its_uncertainty(field: str, what: str)
     kind, errors, stds = "" if field == "u" else "exx", [], []
     for seed in range(100, 120):
         values, std = along(field, 0.03, seed)
-        arrivals = arrival_times(np.arange(FRAMES), values, std, feature=what)
-        front = fit_front(LINE.positions, arrivals, std, LINE.correlation(kind), usable=LINE.is_two_sided)
+        arrivals = arrival_times(np.arange(FRAMES), series(values, std), feature=what)
+        front = fit_front(LINE.positions, arrivals, series(std, std), LINE.correlation(kind), usable=LINE.is_two_sided)
         errors.append(front.speed - TRUE)
         stds.append(front.speed_std)
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stds)))
@@ -89,20 +93,22 @@ def test_the_speed_of_a_pulse_lies_within_its_uncertainty(field: str, what: str)
 
 def test_a_wave_that_comes_back_has_a_negative_speed() -> None:
     values, std = along("u", 0.01, 0)
-    arrivals = arrival_times(np.arange(FRAMES), values[:, ::-1], std)
-    assert fit_front(LINE.positions, arrivals, std, LINE.correlation()).speed == pytest.approx(-TRUE, rel=0.01)
+    arrivals = arrival_times(np.arange(FRAMES), series(values[:, ::-1], std))
+    assert fit_front(LINE.positions, arrivals, series(std, std), LINE.correlation()).speed == pytest.approx(
+        -TRUE, rel=0.01
+    )
 
 
 def test_noise_alone_and_uniform_motion_have_no_front() -> None:
     random = np.random.default_rng(0)
     noise, std = random.normal(0, 1, (FRAMES, len(LINE.points))), np.ones((FRAMES, len(LINE.points)))
-    arrivals = arrival_times(np.arange(FRAMES), noise, std)
+    arrivals = arrival_times(np.arange(FRAMES), series(noise, std))
     with pytest.raises(InputError, match="no front: something arrives at 0 of"):
-        fit_front(LINE.positions, arrivals, std, LINE.correlation())
+        fit_front(LINE.positions, arrivals, series(std, std), LINE.correlation())
     together = noise + 40 * (np.arange(FRAMES) > 30)[:, None] * np.exp(-np.arange(FRAMES) / 60)[:, None]
-    arrivals = arrival_times(np.arange(FRAMES), together, std)
+    arrivals = arrival_times(np.arange(FRAMES), series(together, std))
     with pytest.raises(InputError, match="no front travels along the line"):
-        fit_front(LINE.positions, arrivals, std, LINE.correlation())
+        fit_front(LINE.positions, arrivals, series(std, std), LINE.correlation())
 
 
 POSITIONS, CLOCK = np.arange(0.0, 200, 10), np.arange(60.0)
@@ -114,34 +120,34 @@ def test_a_front_that_still_rises_at_the_end_is_taken_at_a_value_only() -> None:
     """A ramp of -.001 a frame, as a strain: half of what the frames hold of it is no front."""
     random, std = np.random.default_rng(5), np.full(BEHIND.shape, 2e-4)
     values = -0.001 * np.maximum(BEHIND, 0) + random.normal(0, 2e-4, BEHIND.shape)
-    cut = arrival_times(CLOCK, values, std, common_fraction=0.0)
+    cut = arrival_times(CLOCK, series(values, std), common_fraction=0.0)
     assert cut.cut.all()
-    assert np.isnan(cut.times).all()
+    assert np.isnan(cut.times.values).all()
     with pytest.raises(InputError, match="at 20 positions the field still rises in the last of them"):
-        fit_front(POSITIONS, cut, std, np.eye(20), common_fraction=0.0)
-    found = arrival_times(CLOCK, values, std, level=-0.005, common_fraction=0.0)
-    front = fit_front(POSITIONS, found, std, np.eye(20), common_fraction=0.0)
+        fit_front(POSITIONS, cut, series(std, std), np.eye(20), common_fraction=0.0)
+    found = arrival_times(CLOCK, series(values, std), level=-0.005, common_fraction=0.0)
+    front = fit_front(POSITIONS, found, series(std, std), np.eye(20), common_fraction=0.0)
     assert not found.cut.any()
     assert abs(front.speed - 8) < 3 * front.speed_std < 0.2
     assert front.start == pytest.approx(10, abs=0.3)
-    assert np.isnan(arrival_times(CLOCK, values, std, level=0.005).times).all()
+    assert np.isnan(arrival_times(CLOCK, series(values, std), level=0.005).times.values).all()
 
 
 def test_a_plateau_up_to_the_last_frame_is_a_peak() -> None:
     random, std = np.random.default_rng(6), np.full(BEHIND.shape, 2e-4)
     values = 0.01 * np.clip(BEHIND / 6, 0, 1) + random.normal(0, 2e-4, BEHIND.shape)
     for level in ("50%", 0.005):
-        found = arrival_times(CLOCK, values, std, level=level, common_fraction=0.0)
-        assert np.isfinite(found.times).all()
+        found = arrival_times(CLOCK, series(values, std), level=level, common_fraction=0.0)
+        assert np.isfinite(found.times.values).all()
         assert not found.cut.any()
-        front = fit_front(POSITIONS, found, std, np.eye(20), common_fraction=0.0)
+        front = fit_front(POSITIONS, found, series(std, std), np.eye(20), common_fraction=0.0)
         assert abs(front.speed - 8) < 3 * front.speed_std < 0.2
 
 
 @pytest.mark.parametrize("level", ["0%", "100%", 0.0, "nan", "half", "%"])
 def test_a_level_is_a_value_or_part_of_the_peak(level: float | str) -> None:
     with pytest.raises(InputError, match=r"a value of the field other than 0, such as -0.005, or between 0% and 100%"):
-        arrival_times(CLOCK, BEHIND, np.ones(BEHIND.shape), level=level)
+        arrival_times(CLOCK, series(BEHIND, np.ones(BEHIND.shape)), level=level)
 
 
 def test_arrival_times_state_their_noise_and_skip_missing_frames() -> None:
@@ -151,17 +157,18 @@ def test_arrival_times_state_their_noise_and_skip_missing_frames() -> None:
     values = pulse + random.normal(0, 0.03, std.shape)
     values[15, :200] = np.nan
     for what in ("front", "peak"):
-        found = arrival_times(times, values, std, feature=what, common_fraction=0.0)
-        assert 0.85 < found.times.std() / np.median(found.std) < 1.15
+        found = arrival_times(times, series(values, std), feature=what, common_fraction=0.0)
+        assert 0.85 < found.times.values.std() / np.median(found.times.uncertainty) < 1.15
         if what == "peak":
-            assert found.times.mean() == pytest.approx(30.3, abs=0.1)
+            assert found.times.values.mean() == pytest.approx(30.3, abs=0.1)
 
 
 def test_an_abrupt_front_is_uncertain_by_the_interval_of_the_frames() -> None:
     step = np.repeat((np.arange(40) > 20)[:, None] * 1.0, 5, axis=1)
-    found = arrival_times(np.arange(40), step * (1 - 0.001 * np.arange(40))[:, None], np.full(step.shape, 1e-4))
+    falling = series(step * (1 - 0.001 * np.arange(40))[:, None], np.full(step.shape, 1e-4))
+    found = arrival_times(np.arange(40), falling)
     assert found.abrupt
-    np.testing.assert_allclose(found.std, 1 / np.sqrt(12), rtol=0.01)
+    np.testing.assert_allclose(found.times.uncertainty, 1 / np.sqrt(12), rtol=0.01)
 
 
 def test_the_correlation_of_rates_between_frames_is_that_of_slopes_in_noise() -> None:

@@ -276,9 +276,8 @@ def test_frames_beyond_the_times_of_the_simulation_are_left_out_and_those_asked_
     simulation = Simulation.read(states.parent / "all.pvd", offset=1e-3)
     comparison = Comparison(result, simulation, PLACEMENT)
     assert (comparison.frames, comparison.frames_outside) == ((1, 2, 3, 4, 5), (0, 6))
-    assert np.median(comparison.frame(3).measured["v"] / comparison.frame(3).simulated["nodes"]["v"]) == pytest.approx(
-        1.5, rel=0.01
-    )
+    last = comparison.frame(3)
+    assert np.median(last.measured["v"].values / last.simulated["nodes"]["v"]) == pytest.approx(1.5, rel=0.01)
     with pytest.raises(InputError, match=r"frame 6 is at 0\.006 s.* spans 0\.001 to 0\.005: state the `offset`"):
         Comparison(result, simulation, PLACEMENT, frames=[2, 6])
     with pytest.raises(InputError, match=r"the frames of .* are at 0 to 0\.006 s"):
@@ -302,10 +301,10 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
         result, Simulation.read(states.parent / "all.pvd"), find_placement(result, point_pairs=PLACEMENT.pairs.tolist())
     ).frame(3)
     assert written.node_numbers.tolist() == finite_elements().node_numbers.tolist()
-    assert written.fields["displacement"][:, 0] == pytest.approx(made.measured["u"])
+    assert written.fields["displacement"][:, 0] == pytest.approx(made.measured["u"].values)
     assert written.fields["displacement_ratio_levelled"][:, 1] == pytest.approx(made.ratio("levelled", "v"))
     again = Simulation.read(out / "comparison.pvd")  # the measurement, as a simulation's boundary conditions
-    assert again.displacement[0][:, 1] == pytest.approx(made.measured["v"])
+    assert again.displacement[0][:, 1] == pytest.approx(made.measured["v"].values)
     head, row, *_ = (out / "comparison.csv").read_text().splitlines()
     assert head.startswith("frame,number,time_s,way,quantity,unit,values,mean,rms,std,beyond_2,chi_square,")
     one = made.agreement["nodes", "displacement"]
