@@ -101,8 +101,11 @@ class SurfaceInUnits(ResultInUnits):
 
     @cached_property
     def covariance(self) -> NodalCovariance:
-        """Covariance of the nodes' errors, with the surface in space."""
-        return replace(NodalCovariance.from_mesh(self.mesh), surface=self.points)
+        """Covariance of the nodes' errors, with the surface in space and what its match leaves of it."""
+        errors = np.asarray(self.result.stereo["shape_errors"], dtype=np.float64)
+        matched = self.result.stereo["shape_covariance"] - errors @ errors.transpose(0, 2, 1)
+        nodal = NodalCovariance.from_mesh(self.mesh)
+        return replace(nodal, surface=self.points, surface_covariance=np.moveaxis(matched, 0, 2))
 
     @cached_property
     def gauges(self) -> StrainGauges:
