@@ -210,7 +210,7 @@ class Displacement(Field):
         flat = replace(flat, values=self.values)
         if self.covariance is None or other.covariance is None:
             return flat
-        traces = (np.einsum("ii...->...", one.covariance) for one in (self, other))
+        traces = (np.einsum("ii...->...", matrix) for matrix in (self.covariance, other.covariance))
         return replace(flat, covariance=np.where(np.less(*traces), self.covariance, other.covariance))
 
     def since(self, base: Self, common_fraction: float) -> Self:

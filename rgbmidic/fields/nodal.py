@@ -58,6 +58,8 @@ class NodalCovariance:
         ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
     surface : ndarray, shape (n, 3), or None
         Places of the n nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
+    surface_covariance : ndarray, shape (3, 3, n), or None
+        Covariance of each of these places; None: not known.
 
     Examples
     --------
@@ -72,6 +74,7 @@ class NodalCovariance:
     fit: sp.csr_matrix
     bias: sp.csr_matrix
     surface: FloatArray | None = None
+    surface_covariance: FloatArray | None = None
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
@@ -218,8 +221,13 @@ class NodalCovariance:
         NodalCovariance
         """
         fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
-        surface = None if self.surface is None else self.surface[nodes]
-        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)], surface=surface)
+        columns = (part[:, np.unique(part.indices)] for part in (fit, bias))
+        part = replace(self, **dict(zip(("fit", "bias"), columns, strict=True)))
+        if self.surface is not None:
+            part = replace(part, surface=self.surface[nodes])
+        if self.surface_covariance is not None:
+            part = replace(part, surface_covariance=self.surface_covariance[..., nodes])
+        return part
 
 
 def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
@@ -431,8 +439,8 @@ class RigidMotion:
         by_sums[count:, :, 1:] = np.einsum("kl,lij->kij", np.linalg.pinv(normal), axes)
         weights = np.zeros((1 + count, len(nodes)))
         weights[:, is_measured] = np.vstack([np.full(len(arm), 1 / len(arm)), turned.T])
-        by_sums = by_sums.reshape(count + len(axes), -1)
-        std = np.sqrt(np.einsum("ka,ab,kb->k", by_sums, covariance.of_sums(weights, displacement), by_sums))
+        flat = by_sums.reshape(count + len(axes), -1)
+        std = np.sqrt(np.einsum("ka,ab,kb->k", flat, covariance.of_sums(weights, displacement), flat))
         rotation = Rotation.from_matrix(back.T).as_rotvec() if count == 3 else np.arctan2(back[0, 1], back[0, 0])
         return cls(
             centre=centre,

@@ -252,7 +252,7 @@ def _circle(x: float, y: float, radius: float) -> FloatArray:
 
 
 class Gauge:
-    """An extensometer between two points: extension in px and strain, extension over length.
+    """An extensometer between two points: extension and strain, extension over length; in space also the length.
 
     Parameters
     ----------
@@ -294,7 +294,13 @@ class Gauge:
         std = np.sqrt(np.einsum("ta,tab,tb->t", towards, covariance, towards))
         extension = Field(name="extension", unit=displacement.unit, values=values, std=std)
         strain = replace(extension.with_arrays(lambda array: array / length), name="strain", unit="")
-        return of_probe(self.name, [extension, strain])
+        nodal = self._relative.covariance
+        if nodal.surface is None or nodal.surface_covariance is None or not self.moving:
+            return of_probe(self.name, [extension, strain])
+        surface = Displacement(values=nodal.surface.T[:, None], covariance=nodal.surface_covariance)
+        shape = np.einsum("ta,tab,tb->t", towards, nodal.of_sums(weights, surface), towards)
+        deformed = replace(extension, name="length", values=deformed_length, std=np.sqrt(std**2 + shape))
+        return of_probe(self.name, [extension, strain, deformed])
 
 
 class StrainGauge:

@@ -289,11 +289,9 @@ def convert_history(
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
     converted, is_length = units.convert(history), history.unit in ("px", "mm")
     yield converted
-    if (
-        history.std is None
-        or compute_rates is None
-        or (history.unit == "deg" and not history.name.startswith("rigid_rotation"))
-    ):
+    is_direction = history.unit == "deg" and not history.name.startswith("rigid_rotation")
+    # the rates of a length are those of its extension
+    if history.std is None or compute_rates is None or is_direction or history.name.endswith("_length"):
         return
     rate_fields = compute_rates(history)
     for power, name in enumerate(("velocity", "acceleration") if is_length else ("velocity",), start=1):

@@ -62,8 +62,8 @@ class CarriedTable(FrameTable):
                 values |= {name: values[name][self.nodes] for name in of_nodes if len(values[name])}
             if {"status", "node_status"} & values.keys():
                 space = self.stereo.frame(["status", "left_status", "right_status"], frame)
-                statuses = {"status": int(space["status"])}
-                statuses["node_status"] = np.maximum(space["left_status"], space["right_status"])
+                node_status = np.maximum(space["left_status"], space["right_status"])
+                statuses = {"status": int(space["status"]), "node_status": node_status}
                 values |= {name: statuses[name] for name in statuses.keys() & values.keys()}
             yield values
 
@@ -152,7 +152,7 @@ class LeftResult(Result):
         return (*self.stereo.warnings, *self.left.warnings)
 
     @property
-    def reference(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]  # cached there
+    def reference(self) -> npt.NDArray[np.uint8] | None:  # cached there
         """Reference image of each light in the left camera, shape (k, H, W); None where none was kept."""
         return self.left.reference
 

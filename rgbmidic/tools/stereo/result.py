@@ -212,8 +212,8 @@ class StereoResult:
             with self.path.open("rb") as source:
                 shutil.copyfileobj(source, file)
         elif to == "npz":
-            arrays = {"elements": self.elements, "names": np.array(self.names), "time": self.time}
-            np.savez(file, **arrays, **{name: self[name] for name in QUANTITIES})
+            arrays: dict[str, Any] = {"elements": self.elements, "names": np.array(self.names), "time": self.time}
+            np.savez(file, **arrays | {name: self[name] for name in QUANTITIES})
         else:
             entries = [entry for entry in QUANTITIES.values() if entry.axes == ("node",)]
             time = ["time_s"] if self.has_times else []

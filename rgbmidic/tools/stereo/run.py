@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -52,10 +52,6 @@ class RunOptions(TypedDict, total=False):
     resume: bool
     workers: int | None
     progress: ProgressCallback | None
-
-
-class _PartOptions(RunOptions, total=False):
-    frames: range | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,8 +258,8 @@ def measure_stereo_part(
     RgbmidicError
         As of `measure_stereo`.
     """
-    options: _PartOptions = {"frames": frames, "workers": workers, "progress": progress}
-    _measure_cameras((left, right), camera, Path(out), settings, options)
+    options: RunOptions = {"workers": workers, "progress": progress}
+    _measure_cameras((left, right), camera, Path(out), settings, options, frames)
 
 
 def _measure_cameras(
@@ -271,7 +267,8 @@ def _measure_cameras(
     camera: CameraPair | Path | str,
     out: Path,
     settings: StereoSettings,
-    run: _PartOptions,
+    run: RunOptions,
+    frames: range | None = None,
 ) -> tuple[Result, Result, Shape]:
     """Measure both cameras' frames; return both results and the undeformed surface."""
     pair = camera if isinstance(camera, CameraPair) else CameraPair.read(camera)
@@ -282,7 +279,7 @@ def _measure_cameras(
     if images[0].names != images[1].names:
         names = " and ".join(f"{', '.join(of.names)} ({test.name})" for of, test in zip(images, tests, strict=True))
         raise InputError(f"both cameras must see the same lights in the same order; theirs are {names}")
-    first = tests[0].result or measure(tests[0].settings, out / "left", **_resumable(out / "left", run))
+    first = tests[0].result or measure(tests[0].settings, out / "left", **_options(out / "left", run, frames))
     mesh_pair = carry_mesh(
         images,
         Tri3Mesh(nodes=first.nodes, elements=first.elements),
@@ -291,7 +288,9 @@ def _measure_cameras(
         solver=tests[0].settings.solver,
     )
     shape = Shape.of(pair, mesh_pair, axes=settings.axes, gauge=settings.gauge, measure=settings.measure)
-    second = _measure_right(tests[1], mesh_pair.right, mesh_pair.region, out / "right", run)
+    second = _measure_right(
+        tests[1], mesh_pair.right, mesh_pair.region, out / "right", _options(out / "right", run, frames)
+    )
     return first, second, shape
 
 
@@ -301,17 +300,17 @@ def _path_from(out: Path, path: Path) -> str:
     return path.relative_to(out).as_posix() if path.is_relative_to(out) else str(path)
 
 
-def _resumable(out: Path, run: _PartOptions) -> _PartOptions:
+def _options(out: Path, run: RunOptions, frames: range | None) -> dict[str, Any]:
     """Return the options of a run into a folder: one that has not begun is not resumed."""
-    return {**run, "resume": run.get("resume", False) and is_result(out)}
+    return {**run, "resume": run.get("resume", False) and is_result(out), "frames": frames}
 
 
-def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, run: _PartOptions) -> Result:
+def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, options: dict[str, Any]) -> Result:
     """Measure the right test on the carried mesh; a result that was measured on it is taken as it is."""
     if test.result is not None and np.array_equal(test.result.nodes, mesh.nodes):
         return test.result
-    mesh_settings = MeshSettings(element_size=mesh.size, error=test.settings.mesh.error)
-    return measure(replace(test.settings, mesh=mesh_settings), out, mesh=mesh, region=region, **_resumable(out, run))
+    settings = replace(test.settings, mesh=MeshSettings(element_size=mesh.size, error=test.settings.mesh.error))
+    return measure(settings, out, mesh=mesh, region=region, **options)
 
 
 def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:

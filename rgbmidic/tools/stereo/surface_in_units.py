@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, BinaryIO, ClassVar, Self
+from typing import TYPE_CHECKING, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from rgbmidic.tools.stereo.left_result import LeftResult
 
 
-_SPACE = {
-    **dict.fromkeys(("x", "y", "z"), "displacement"),
+_SPACE: dict[str, Literal["displacement", "strain"]] = {
+    "x": "displacement",
+    "y": "displacement",
+    "z": "displacement",
     "tilt": "strain",
     "epipolar_common": "displacement",
     "epipolar_change": "displacement",
@@ -99,8 +101,11 @@ class SurfaceInUnits(ResultInUnits):
 
     @cached_property
     def covariance(self) -> NodalCovariance:
-        """Covariance of the nodes' errors, with the surface in space."""
-        return replace(NodalCovariance.from_mesh(self.mesh), surface=self.points)
+        """Covariance of the nodes' errors, with the surface in space and what its match leaves of it."""
+        errors = np.asarray(self.result.stereo["shape_errors"], dtype=np.float64)
+        matched = self.result.stereo["shape_covariance"] - errors @ errors.transpose(0, 2, 1)
+        nodal = NodalCovariance.from_mesh(self.mesh)
+        return replace(nodal, surface=self.points, surface_covariance=np.moveaxis(matched, 0, 2))
 
     @cached_property
     def gauges(self) -> StrainGauges:

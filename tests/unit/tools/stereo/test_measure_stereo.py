@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stereo_scene import DISTANCE, MOTIONS, SHAPE, Motion, image, pair_of, write_tests
+from stereo_scene import DISTANCE, MOTIONS, SHAPE, Motion, image
 
 from rgbmidic import Region, Result, Tri3Mesh
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
@@ -25,19 +25,6 @@ from rgbmidic.tools.stereo import (
     measure_stereo_part,
     open_left,
 )
-
-
-@pytest.fixture(scope="module")
-def pair():
-    return pair_of(20.0, (2000.0, 80.0, 60.0, -0.4, 0, 0, 0, 0))
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory, pair):
-    folder = tmp_path_factory.mktemp("stereo")
-    left, right, camera = write_tests(folder, pair)
-    settings = StereoSettings(axes="camera")
-    return folder, measure_stereo(left, right, camera, folder / "result", settings, workers=1)
 
 
 def ratios(result, names, true, frame=None):
