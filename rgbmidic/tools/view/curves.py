@@ -22,8 +22,8 @@ from rgbmidic.tools.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.tools.view.canvas import columns, plain_plot
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.fields import FieldsInView
+from rgbmidic.tools.view.marks import Mark, probe_marks, settings_of_marks
 from rgbmidic.tools.view.time_line import FRAME_MARK_STYLE
-from rgbmidic.tools.view.url_state import Mark, probe_marks, settings_of_marks
 from rgbmidic.tools.view.widgets import Background, ResultControls, warning
 from rgbmidic.typing import FloatArray
 

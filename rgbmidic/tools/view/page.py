@@ -26,9 +26,10 @@ from rgbmidic.tools.view.curves import CurvePanel
 from rgbmidic.tools.view.fields import FieldsInView
 from rgbmidic.tools.view.line_panel import LinePanel
 from rgbmidic.tools.view.map_panel import MapPanel
+from rgbmidic.tools.view.marks import SCALE, Mark, UndoHistory
 from rgbmidic.tools.view.panels import FileButtons, MovieButton, ProbeNames
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
-from rgbmidic.tools.view.url_state import BACKGROUNDS, EXTRA_FIELDS, SCALE, UNCERTAINTY, Mark, UndoHistory, ViewState
+from rgbmidic.tools.view.url_state import BACKGROUNDS, EXTRA_FIELDS, UNCERTAINTY, ViewState
 from rgbmidic.tools.view.widgets import ResultControls, SharedState, call_periodically, run_guarded, script, warning
 
 if TYPE_CHECKING:

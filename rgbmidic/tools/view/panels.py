@@ -18,17 +18,9 @@ from rgbmidic.results import Maps
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, read_section, to_plain
 from rgbmidic.tools.report import FieldMovie, write_movie
 from rgbmidic.tools.view.fields import FieldsInView
+from rgbmidic.tools.view.marks import KINDS, SCALE, Mark, common_gauge, marks_of_probes, probe_marks, settings_of_marks
 from rgbmidic.tools.view.picture import RawPictures
 from rgbmidic.tools.view.test_file_editor import Confirmation, Draft
-from rgbmidic.tools.view.url_state import (
-    KINDS,
-    SCALE,
-    Mark,
-    common_gauge,
-    marks_of_probes,
-    probe_marks,
-    settings_of_marks,
-)
 from rgbmidic.tools.view.widgets import WRITABLE_SECTIONS, ResultControls, warning
 
 

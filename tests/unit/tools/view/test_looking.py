@@ -32,21 +32,11 @@ from rgbmidic.tools.report.style import time_axis
 from rgbmidic.tools.view import curves
 from rgbmidic.tools.view.curves import CurvePanel
 from rgbmidic.tools.view.fields import FieldsInView, element_at, palette_name, range_over_test, robust_range
-from rgbmidic.tools.view.map_panel import LabelLayer, arrow_lines, contour_lines, place_texts
+from rgbmidic.tools.view.layers import LabelLayer, arrow_lines, contour_lines, place_texts
+from rgbmidic.tools.view.marks import MARKS, Mark, UndoHistory, marks_of_probes, probe_marks, settings_of_marks
 from rgbmidic.tools.view.page import ResultPage
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
-from rgbmidic.tools.view.url_state import (
-    CLOCKS,
-    MARKS,
-    PALETTES,
-    UNCERTAINTY,
-    Mark,
-    UndoHistory,
-    ViewState,
-    marks_of_probes,
-    probe_marks,
-    settings_of_marks,
-)
+from rgbmidic.tools.view.url_state import CLOCKS, PALETTES, UNCERTAINTY, ViewState
 from rgbmidic.tools.view.widgets import ResultControls, is_watched
 
 NAMES = ("u", "v", "e1")
