@@ -5,34 +5,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
 
-import bokeh.models as bk
-
 from rgbmidic.fields import MEASURES, Units
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.controls import BACKGROUNDS, CONTROLS
 from rgbmidic.tools.view.marks import MARKS, SCALE, Mark, common_gauge, marks_of_probes
 
-BACKGROUNDS = ("reference", "deformed")
 EXTRA_FIELDS = ("second", "third", "fourth")
 """Entries of the view that name fields beside the first."""
 UNCERTAINTY = "uncertainty"
 """Name of the field beside the first that is its standard uncertainty, whatever that is."""
-PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twilight")
-"""Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
-_CLOCKS = {"offset": "an offset", "trigger": "a trigger", "correlation": "correlation"}
-CLOCKS = tuple(_CLOCKS)
-"""Ways to relate the time of channels to that of the frames."""
-_RANGES = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
-
-
-def view_entry(default: Any, widget: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
-    """Declare an entry of the view: its default, and widget, text and options of its control, which limit the value."""
-    return field(default=default, metadata={"control": (widget, text, options)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,54 +81,48 @@ class ViewState:
     """
 
     frame: int = 0
-    field: str = view_entry("u", bk.Select, "Field")
-    over: str = view_entry(BACKGROUNDS[0], options=BACKGROUNDS)
-    range: str = view_entry("frame", bk.Select, "Colours from", options=_RANGES)
-    low: float = view_entry(-1.0, bk.NumericInput, "lowest", mode="float")
-    high: float = view_entry(1.0, bk.NumericInput, "highest", mode="float")
-    symmetric: bool = view_entry(False, bk.Checkbox, "symmetric about 0")
-    directions: bool = view_entry(False, bk.Checkbox, "principal directions")
-    opacity: float = view_entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
-    second: str = view_entry("", bk.Select, "Second field")
-    third: str = view_entry("", bk.Select, "Third field")
-    fourth: str = view_entry("", bk.Select, "Fourth field")
-    palette: str = view_entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
-    levels: int = view_entry(256, bk.Spinner, "Number of colours", low=2, high=256)
-    hatched: bool = view_entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
-    vectors: bool = view_entry(False, bk.Checkbox, "displacement as arrows")
-    longer: float = view_entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
-    contours: bool = view_entry(False, bk.Checkbox, "contour lines")
-    extremes: bool = view_entry(False, bk.Checkbox, "smallest and largest value")
-    blank: bool = view_entry(False, bk.Checkbox, "nodes without data")
-    gauge: float = view_entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
-    measure: str = view_entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
-    since: int = view_entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
-    rigid: bool = view_entry(False, bk.Checkbox, "rigid motion removed")
-    rate_window: int = view_entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
-    curve: str = view_entry("")
-    along: str = view_entry("", bk.Select, "Along x")
-    channels: str = view_entry("", bk.TextInput, "CSV file beside the test")
-    clock: str = view_entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
-    offset: float = view_entry(0.0, bk.NumericInput, "Offset, s", mode="float")
-    trigger: str = view_entry("", bk.Select, "Trigger channel")
-    align: str = view_entry("", bk.Select, "Channel")
-    align_to: str = view_entry("", bk.Select, "alike to")
-    area: float = view_entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
-    force: str = view_entry("", bk.Select, "Force")
-    beside: str = view_entry("", bk.Select, "Beside the curves")
-    distance: float = view_entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
-    distance_std: float = view_entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
-    camera: str = view_entry("", bk.TextInput, "or camera")
-    line: str = view_entry("")
-    theme: str = view_entry("", options=("light", "dark"))
+    field: str = "u"
+    over: str = BACKGROUNDS[0]
+    range: str = "frame"
+    low: float = -1.0
+    high: float = 1.0
+    symmetric: bool = False
+    directions: bool = False
+    opacity: float = 0.85
+    second: str = ""
+    third: str = ""
+    fourth: str = ""
+    palette: str = ""
+    levels: int = 256
+    hatched: bool = False
+    vectors: bool = False
+    longer: float = 0.0
+    contours: bool = False
+    extremes: bool = False
+    blank: bool = False
+    gauge: float = 0.0
+    measure: str = MEASURES[0]
+    since: int = -1
+    rigid: bool = False
+    rate_window: int = 0
+    curve: str = ""
+    along: str = ""
+    channels: str = ""
+    clock: str = "offset"
+    offset: float = 0.0
+    trigger: str = ""
+    align: str = ""
+    align_to: str = ""
+    area: float = 0.0
+    force: str = ""
+    beside: str = ""
+    distance: float = 0.0
+    distance_std: float = 0.0
+    camera: str = ""
+    line: str = ""
+    theme: str = ""
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()
-
-    @classmethod
-    def controls(cls) -> dict[str, tuple[type[bk.Widget], str, dict[str, Any]]]:
-        """Return kind, text and options of the controls, by the entries that they set."""
-        controls = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
-        return {name: control for name, control in controls.items() if control[0] is not None}
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
@@ -190,7 +171,7 @@ class ViewState:
         if self.channels or settings.file is None:
             return self
         align, align_to = settings.align or ("", "")
-        clock = CLOCKS[1] if settings.trigger else CLOCKS[2] if settings.align else CLOCKS[0]
+        clock = "trigger" if settings.trigger else "correlation" if settings.align else "offset"
         keys: dict[str, Any] = {"clock": clock, "offset": settings.offset, "area": settings.area or 0.0}
         keys |= {"trigger": settings.trigger or "", "align": align, "align_to": align_to, "force": settings.force or ""}
         return replace(self, channels=str(settings.file), **keys)
@@ -245,7 +226,7 @@ def _format_entry(value: object) -> str:
 
 def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
     """Return the value that a text states for an entry; None where it is invalid."""
-    _, _, options = entry.metadata.get("control", (None, "", {}))
+    options = CONTROLS[entry.name].options if entry.name in CONTROLS else {}
     try:
         if isinstance(entry.default, bool):
             return bool(int(text))
@@ -266,12 +247,9 @@ def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
         return None
     if entry.name in ("field", *EXTRA_FIELDS):
         return text if text in names or (text == UNCERTAINTY and entry.name in EXTRA_FIELDS) else None
-    if "options" in options:
-        return (
-            text
-            if text in [option if isinstance(option, str) else option[0] for option in options["options"]]
-            else None
-        )
+    choices = {"over": BACKGROUNDS, "theme": ("light", "dark")}.get(entry.name, options.get("options"))
+    if choices is not None:
+        return text if text in [choice if isinstance(choice, str) else choice[0] for choice in choices] else None
     return text[: VIEWER.address_letters]
 
 
