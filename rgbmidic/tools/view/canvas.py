@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 from rgbmidic.tools.report.painter import ImageWindow
 from rgbmidic.tools.report.style import view_limits
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.url_state import Mark
+from rgbmidic.tools.view.marks import Mark
 from rgbmidic.typing import AnyArray, FloatArray
 
 IMAGE = "image x y dw dh"

@@ -21,10 +21,11 @@ from rgbmidic.tools.report import history_figure
 from rgbmidic.tools.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.tools.view.canvas import columns, plain_plot
 from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.controls import ResultControls
 from rgbmidic.tools.view.fields import FieldsInView
+from rgbmidic.tools.view.marks import Mark, probe_marks, settings_of_marks
 from rgbmidic.tools.view.time_line import FRAME_MARK_STYLE
-from rgbmidic.tools.view.url_state import Mark, probe_marks, settings_of_marks
-from rgbmidic.tools.view.widgets import Background, ResultControls, warning
+from rgbmidic.tools.view.widgets import Background, warning
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ class CurvePanel:
         for event in (PanStart, PanEnd, Pan):
             self.plot.on_event(event, self._drag)
         controls.message.text = _HINT
-        controls.curve.on_change("value", lambda attr, old, new: self.draw())
+        controls["curve"].on_change("value", lambda attr, old, new: self.draw())
 
     def _make_plot(self) -> None:
         wheel, hover, self.pan = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False), bk.PanTool()
@@ -178,13 +179,13 @@ class CurvePanel:
             ("beside", "none", names), ("align_to", "choose", probe_quantities), ("along", "time", quantities),
         ):  # fmt: skip
             selected = getattr(view, entry)
-            controls.entry_controls[entry].options = [
+            controls[entry].options = [
                 ("", blank_label),
                 *dict.fromkeys([*choices, *([selected] if selected else [])]),
             ]
         clock_entries = {"trigger": "trigger", "align": "correlation", "align_to": "correlation", "offset": "offset"}
         for entry, clock in clock_entries.items():
-            controls.entry_controls[entry].visible = view.clock == clock
+            controls[entry].visible = view.clock == clock
 
     def _receive(self, read_result: Callable[[], Histories | None]) -> None:
         self.reading = False
@@ -206,7 +207,7 @@ class CurvePanel:
             if any(_probe(quantity, self._colours) not in previous_probes for quantity in quantities)
         ]
         candidates, current = new_labels or list(by_label), self._fields.view.curve
-        self._controls.curve.value = current if current in candidates or not candidates else candidates[0]
+        self._controls["curve"].value = current if current in candidates or not candidates else candidates[0]
         self.draw()
         self.offer_choices()
         self.mark_frame(self._fields.view.frame)
@@ -223,14 +224,14 @@ class CurvePanel:
                 text = "<br>".join(map(html.escape, self.histories.remarks[len(self._probed.remarks) :]))
             except RgbmidicError as error:
                 text = warning(str(error))
-        self._controls.channel_status.text = text
+        self._controls["channel_status"].text = text
         by_label = {} if self.histories is None else group_quantities(self.histories, self._colours)
-        self._controls.curve.options = list(by_label)
+        self._controls["curve"].options = list(by_label)
         return by_label
 
     def draw(self) -> None:
         """Draw the chosen curve of all probes."""
-        label, (x, axis), bands, lines = self._controls.curve.value, self._x, [], []
+        label, (x, axis), bands, lines = self._controls["curve"].value, self._x, [], []
         by_label = {} if self.histories is None else group_quantities(self.histories, self._colours)
         for quantity in by_label.get(label, []):
             colour = self._colours.get(_probe(quantity, self._colours), OKABE_ITO["grey"])
@@ -245,7 +246,7 @@ class CurvePanel:
 
     def figure(self) -> Figure | None:
         """Draw the chosen curve of all probes for print; None where there is none."""
-        label = self._controls.curve.value
+        label = self._controls["curve"].value
         if (
             self.reading
             or self.histories is None
@@ -275,7 +276,7 @@ class CurvePanel:
     def _drag(self, event: Any) -> None:
         """Move the channels along the time with the pointer; their offset is stated where it lets go."""
         controls, times = self._controls, None if self.histories is None else self.histories.times
-        if not controls.drag.active or event.x is None:
+        if not controls["drag"].active or event.x is None:
             return
         if isinstance(event, PanStart):
             self._grabbed = None if self.channels is None or self._x_quantity else (event.x, self.channels)
@@ -284,9 +285,9 @@ class CurvePanel:
         grab_x, channels = self._grabbed
         shifted = channels.with_offset((event.x - grab_x) / time_unit(times)[0])
         self._draw_channel(shifted)
-        controls.drag.label = f"Offset {shifted.offset:.6g} s"
+        controls["drag"].label = f"Offset {shifted.offset:.6g} s"
         if isinstance(event, PanEnd):
-            controls.entry_controls["clock"].value, controls.entry_controls["offset"].value = (
+            controls["clock"].value, controls["offset"].value = (
                 "offset",
                 float(f"{shifted.offset:.9g}"),
             )

@@ -23,8 +23,8 @@ from rgbmidic.tools.view.canvas import IMAGE, columns, plain_plot
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.curves import uncertainty_band
 from rgbmidic.tools.view.fields import FieldsInView
+from rgbmidic.tools.view.marks import probe_marks, probe_position
 from rgbmidic.tools.view.time_line import FRAME_MARK_STYLE
-from rgbmidic.tools.view.url_state import probe_marks, probe_position
 from rgbmidic.tools.view.widgets import LIVE_REGION, Background, aria_group, warning
 
 if TYPE_CHECKING:

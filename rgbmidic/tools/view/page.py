@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import io
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +22,16 @@ from rgbmidic.text import format_with_std
 from rgbmidic.tools.report.style import data_url
 from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.controls import BACKGROUNDS, CONTROLS, ResultControls
 from rgbmidic.tools.view.curves import CurvePanel
 from rgbmidic.tools.view.fields import FieldsInView
 from rgbmidic.tools.view.line_panel import LinePanel
 from rgbmidic.tools.view.map_panel import MapPanel
+from rgbmidic.tools.view.marks import SCALE, Mark, UndoHistory
 from rgbmidic.tools.view.panels import FileButtons, MovieButton, ProbeNames
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
-from rgbmidic.tools.view.url_state import BACKGROUNDS, EXTRA_FIELDS, SCALE, UNCERTAINTY, Mark, UndoHistory, ViewState
-from rgbmidic.tools.view.widgets import ResultControls, SharedState, call_periodically, run_guarded, script, warning
+from rgbmidic.tools.view.url_state import EXTRA_FIELDS, UNCERTAINTY, ViewState
+from rgbmidic.tools.view.widgets import SharedState, call_periodically, run_guarded, script, warning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,17 +105,16 @@ class ResultPage:
         self._offer_fields()
         self.curves.offer_choices()
         self.names.offer_probes()
-        controls.entry_controls["since"].high = len(self.result) - 1
-        controls.over.active = BACKGROUNDS.index(view.over)
+        controls["since"].high = len(self.result) - 1
+        controls["over"].active = BACKGROUNDS.index(view.over)
         self._draw_progress()
-        for entry, (widget, *_) in view.controls().items():
-            key = "active" if widget is bk.Checkbox else "value"
-            controls.entry_controls[entry].update(**{key: getattr(view, entry)})
-            controls.entry_controls[entry].on_change(key, partial(self._set, entry))
+        for entry in (entry.name for entry in fields(view) if entry.name in CONTROLS and entry.name != "over"):
+            key = "active" if isinstance(controls[entry], bk.Checkbox) else "value"
+            controls[entry].update(**{key: getattr(view, entry)})
+            controls[entry].on_change(key, partial(self._set, entry))
         for model, key, change in (
             (self.state, "requested_frame", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
-            (controls.over, "active", lambda index: {"over": BACKGROUNDS[index]}),
-            (controls.curve, "value", lambda name: {"curve": name}),
+            (controls["over"], "active", lambda index: {"over": BACKGROUNDS[index]}),
         ):
             model.on_change(key, lambda attr, old, new, change=change: self.update_view(**change(new)))
 
@@ -122,21 +123,21 @@ class ResultPage:
         groups: dict[str, list[tuple[str, str]]] = {}
         for field in self.fields.maps.quantities.values():
             groups.setdefault(field.group, []).append((field.name, field.label))
-        controls = self.controls.entry_controls
+        controls = self.controls
         controls["field"].options = groups
         for name in EXTRA_FIELDS:
             controls[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
 
     def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
         """Take the value of a control into the view; a range by hand starts from that in view."""
-        low, high = (self.controls.entry_controls[name] for name in ("low", "high"))
+        low, high = (self.controls[name] for name in ("low", "high"))
         if new is None:  # a number that was deleted
             return
         if entry == "range" and new == "hand":
             mapper = self.maps.canvas.colours
             self.fields.view = replace(self.view, range="hand")
             low.value, high.value = float(mapper.low), float(mapper.high)
-        if entry in ("low", "high", "range") and self.controls.entry_controls["range"].value == "hand":
+        if entry in ("low", "high", "range") and self.controls["range"].value == "hand":
             is_range = None not in (low.value, high.value) and low.value < high.value
             self.update_view(range="hand", **({"low": low.value, "high": high.value} if is_range else {}))
         else:
@@ -146,17 +147,19 @@ class ResultPage:
         controls = self.controls
         self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._receive_marks())
         for button, action in (
-            (controls.write, self.file.write), (controls.csv, self._save),
-            (controls.load_probes, lambda: self._take_marks(self.file.read_probes())),
-            (controls.lock, lambda: controls.entry_controls["range"].update(value="hand")),
-            (controls.clear, lambda: self._take_marks(())),
-            (controls.undo, lambda: self.update_view(marks=self.steps.step(back=True))),
-            (controls.redo, lambda: self.update_view(marks=self.steps.step(back=False))),
+            (controls["write"], self.file.write), (controls["csv"], self._save),
+            (controls["load_probes"], lambda: self._take_marks(self.file.read_probes())),
+            (controls["lock"], lambda: controls["range"].update(value="hand")),
+            (controls["clear"], lambda: self._take_marks(())),
+            (controls["undo"], lambda: self.update_view(marks=self.steps.step(back=True))),
+            (controls["redo"], lambda: self.update_view(marks=self.steps.step(back=False))),
         ):  # fmt: skip
-            button.on_click(partial(run_guarded, action, lambda text: controls.save_status.update(text=warning(text))))
-        for button, action in ((controls.print, self._print_maps), (controls.png, self._print_curves)):
+            button.on_click(
+                partial(run_guarded, action, lambda text: controls["save_status"].update(text=warning(text)))
+            )
+        for button, action in ((controls["print"], self._print_maps), (controls["png"], self._print_curves)):
             button.on_click(partial(run_guarded, action, self.report_error))
-        controls.drag.js_on_change("active", script("hold", toggle=controls.drag, pan=self.curves.pan))
+        controls["drag"].js_on_change("active", script("hold", toggle=controls["drag"], pan=self.curves.pan))
         controls.movie.on_change("active", lambda attr, old, new: run_guarded(self.film.press, self.film.stop))
         self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
         for plot in (self.timeline.plot, self.curves.plot, self.line.wave):
@@ -199,7 +202,7 @@ class ResultPage:
         self.report_error(text)
 
     def _draw(self) -> None:
-        view, fields, controls = self.view, self.fields, self.controls.entry_controls
+        view, fields, controls = self.view, self.fields, self.controls
         self._choose()
         field, values = fields.maps.quantities[view.field], fields.values(view.field)
         picture, remark = fields.picture
@@ -222,9 +225,9 @@ class ResultPage:
             scale, scale_text = self.fields.scale, ""
             if scale and not self.view.camera and scale.mm_per_pixel is not None:
                 scale_text = format_with_std(scale.mm_per_pixel, scale.mm_per_pixel_std, "mm/px")
-            self.controls.scale_label.text = scale_text
+            self.controls["scale_label"].text = scale_text
         except RgbmidicError as error:
-            self.controls.scale_label.text = warning(str(error))
+            self.controls["scale_label"].text = warning(str(error))
         self.fields.derive_fields()
 
     def _redraw(self) -> None:

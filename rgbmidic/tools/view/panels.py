@@ -17,19 +17,12 @@ from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
 from rgbmidic.results import Maps
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, read_section, to_plain
 from rgbmidic.tools.report import FieldMovie, write_movie
+from rgbmidic.tools.view.controls import WRITABLE_SECTIONS, ResultControls
 from rgbmidic.tools.view.fields import FieldsInView
+from rgbmidic.tools.view.marks import KINDS, SCALE, Mark, common_gauge, marks_of_probes, probe_marks, settings_of_marks
 from rgbmidic.tools.view.picture import RawPictures
 from rgbmidic.tools.view.test_file_editor import Confirmation, Draft
-from rgbmidic.tools.view.url_state import (
-    KINDS,
-    SCALE,
-    Mark,
-    common_gauge,
-    marks_of_probes,
-    probe_marks,
-    settings_of_marks,
-)
-from rgbmidic.tools.view.widgets import WRITABLE_SECTIONS, ResultControls, warning
+from rgbmidic.tools.view.widgets import warning
 
 
 class ProbeNames:
@@ -49,21 +42,21 @@ class ProbeNames:
         self, controls: ResultControls, fields: FieldsInView, take_marks: Callable[[tuple[Mark, ...]], None]
     ) -> None:
         self._controls, self._fields, self._take_marks = controls, fields, take_marks
-        controls.name.on_change("value", lambda attr, old, new: self._rename(new.strip()))
-        controls.probe.on_change("value", lambda attr, old, new: self.offer_probes())
+        controls["name"].on_change("value", lambda attr, old, new: self._rename(new.strip()))
+        controls["probe"].on_change("value", lambda attr, old, new: self.offer_probes())
 
     def offer_probes(self) -> None:
         """Offer the probes that marks make, and the name of the one that is chosen."""
-        probe, probes = self._controls.probe, probe_marks(self._fields.view.marks)
+        probe, probes = self._controls["probe"], probe_marks(self._fields.view.marks)
         probe.options = list(probes)
         if probe.value not in probes:
             probe.value = next(iter(probes), "")
-        self._controls.name.value = probes[probe.value][0].name if probes else ""
+        self._controls["name"].value = probes[probe.value][0].name if probes else ""
 
     def _rename(self, name: str) -> None:
         """Give the chosen probe a name; empty: its kind and number."""
         controls, marks = self._controls, self._fields.view.marks
-        group = probe_marks(marks).get(controls.probe.value)
+        group = probe_marks(marks).get(controls["probe"].value)
         if group is None or name == group[0].name:
             return
         if name and (not PROBE_NAME.fullmatch(name) or any(mark.name == name for mark in marks)):
@@ -74,7 +67,7 @@ class ProbeNames:
             return
         self._take_marks(tuple(replace(mark, name=name) if mark is group[0] else mark for mark in marks))
         renamed = probe_marks(self._fields.view.marks)
-        controls.probe.value = name or next(
+        controls["probe"].value = name or next(
             key for key, renamed_group in renamed.items() if renamed_group[1:] == group[1:]
         )
 
@@ -96,7 +89,7 @@ class FileButtons:
     def write(self) -> None:
         """Write the chosen sections into a TEST.toml, which must be confirmed where it exists."""
         controls, fields = self._controls, self._fields
-        draft = Draft.from_result(fields.result, Path(controls.file.value))
+        draft = Draft.from_result(fields.result, Path(controls["file"].value))
         probe_settings = settings_of_marks(
             fields.view.marks, fields.gauge, fields.result.section(ProbeSettings), fields.measure
         )
@@ -105,31 +98,31 @@ class FileButtons:
             "channels": lambda: channel_section(draft, fields.channels),
             "scale": lambda: scale_section(draft, fields.scale),
         }
-        names = [WRITABLE_SECTIONS[index] for index in sorted(controls.sections_to_write.active)]
+        names = [WRITABLE_SECTIONS[index] for index in sorted(controls["sections_to_write"].active)]
         if not names:
             raise InputError(f"choose what is written: {', '.join(WRITABLE_SECTIONS)}")
         edited = draft.with_values({name: section_makers[name]() for name in names})
         edited.check()
         sections = " and ".join(f"[{name}]" for name in names)
         if question := self._confirmation.question([draft.file], f"{sections} in it"):
-            controls.save_status.text = warning(question)
+            controls["save_status"].text = warning(question)
             return
         edited.write()
-        controls.save_status.text = html.escape(
+        controls["save_status"].text = html.escape(
             f"{sections} of {draft.file} {'is' if len(names) == 1 else 'are'} written."
         )
 
     def read_probes(self) -> tuple[Mark, ...]:
         """Return the marks of the probes that a TEST.toml states, and those of the scale; sets the gauge."""
-        draft = Draft.from_result(self._fields.result, Path(self._controls.file.value))
+        draft = Draft.from_result(self._fields.result, Path(self._controls["file"].value))
         settings = read_section(ProbeSettings, "probes", draft.section("probes"))
         if (gauge := common_gauge(settings)) is None:
             raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
         if gauge:
-            self._controls.entry_controls["gauge"].value = gauge
-        self._controls.save_status.text = (
-            f"{len(settings.kind_coordinates)} probes are read from {html.escape(str(draft.file))}."
-        )
+            self._controls["gauge"].value = gauge
+        self._controls[
+            "save_status"
+        ].text = f"{len(settings.kind_coordinates)} probes are read from {html.escape(str(draft.file))}."
         return (*marks_of_probes(settings), *(mark for mark in self._fields.view.marks if mark.kind == SCALE))
 
 

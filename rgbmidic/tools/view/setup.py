@@ -24,16 +24,16 @@ from rgbmidic.tools.report.painter import OUTSIDE_GREY, Overlay, paint, palette
 from rgbmidic.tools.report.style import colour_range
 from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
-from rgbmidic.tools.view.test_file_editor import (
+from rgbmidic.tools.view.drawing import (
     SHAPES,
-    Confirmation,
-    Draft,
+    RegionDrawing,
     check_complete,
     marks_of_region,
     region_of,
     region_section,
 )
+from rgbmidic.tools.view.setup_panel import RAW, DraftFrames, Run, SetupControls, overview, pictures
+from rgbmidic.tools.view.test_file_editor import Confirmation, Draft
 from rgbmidic.tools.view.widgets import Background, SharedState, call_periodically, run_guarded, script, warning
 
 _EXPECTED = "expected uncertainty"
@@ -75,7 +75,8 @@ class SetupPage:
         self.canvas = Canvas(document, tuple(SHAPES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.update_picture)
         self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
         self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
-        self.drawing = RegionDrawing(document, self.canvas, marks_of_region(draft), self._remesh)
+        marks = marks_of_region(draft.section("region"), draft.file.parent)
+        self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
         self.confirmation = Confirmation()
         self._offer_lights()
         self._listen()
@@ -247,7 +248,7 @@ class SetupPage:
             changes["mesh"] = {"element_size": size}
         if controls.calibration.value:
             changes["calibration"] = {"file": controls.calibration.value}
-        if region := region_section(self.draft, self.drawing.marks):
+        if region := region_section(self.draft.section("region"), self.drawing.marks):
             changes["region"] = region
         return self.draft.with_values(changes)
 

@@ -1,4 +1,4 @@
-"""Parts of the page that sets a test up: frames, raw and inspected, the drawn region, controls, the run."""
+"""Parts of the page that sets a test up: frames, raw and inspected, controls, the run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import html
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ import bokeh.models as bk
 import cv2
 import numpy as np
 import numpy.typing as npt
-from bokeh.document import Document
 from bokeh.layouts import column, row
 
 from rgbmidic.errors import ResultError
@@ -30,12 +28,9 @@ from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.tools.lab.inspection import Inspection, inspect_frame
 from rgbmidic.tools.report.page import render
 from rgbmidic.tools.report.painter import Picture
-from rgbmidic.tools.report.style import OKABE_ITO
-from rgbmidic.tools.view.canvas import Canvas, columns
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.picture import grey_picture, stretch_to_uint8
-from rgbmidic.tools.view.test_file_editor import HOLES, MASK, Draft, keep_one_outline, masks_of, rings
-from rgbmidic.tools.view.url_state import Mark, UndoHistory
+from rgbmidic.tools.view.test_file_editor import Draft
 from rgbmidic.tools.view.widgets import Controls
 
 RAW = "raw frame"
@@ -119,99 +114,6 @@ def overview(inspection: Inspection, pictures_by_name: Mapping[str, Picture], ra
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
         tiles.append((name.replace("reflection index", "index"), base64.b64encode(png.tobytes()).decode()))
     return render("tiles.html", Path(__file__).parent, across=1 + len(inspection.images.names), tiles=tiles)
-
-
-_COLOURS = list(OKABE_ITO.values())
-"""Of the masks; the first two are those of holes and outline."""
-
-
-class RegionDrawing:
-    """Marks of the region on a canvas, which can be undone, and the lines that they make.
-
-    Parameters
-    ----------
-    document
-        Document of the page.
-    canvas
-        Plot on which they are set and drawn.
-    marks
-        Marks at first.
-    changed
-        Called when they have changed.
-
-    Attributes
-    ----------
-    light
-        Name of the light of which masks are drawn from now on.
-    """
-
-    def __init__(
-        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], on_change: Callable[[], None]
-    ) -> None:
-        self._document, self._canvas, self._on_change = document, canvas, on_change
-        self.light = ""
-        self._steps, self._hole, self._redraw_pending = UndoHistory(marks), 1, False
-        self._rings = bk.ColumnDataSource(columns("xs ys colour"), name="rings")
-        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
-        canvas.place_marks(marks)
-        canvas.marks.on_change("data", lambda attr, old, new: self._receive_marks())
-
-    @property
-    def marks(self) -> tuple[Mark, ...]:
-        """The marks."""
-        return self._steps.marks
-
-    def step(self, *, back: bool) -> None:
-        """Return to the marks before the last step, or do it again."""
-        self._canvas.place_marks(self._steps.step(back=back))
-        self.draw()
-
-    def next_hole(self) -> None:
-        """Let the marks of a hole or a mask that are set from now on belong to another one."""
-        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
-        self._hole = max(map(int, numbers), default=0) + 1
-
-    def settle(self) -> None:
-        """Draw the lines of marks that were set just now."""
-        if self._redraw_pending:
-            self.draw()
-
-    def draw(self) -> None:
-        """Draw the lines."""
-        self._redraw_pending = False
-        outline, holes = rings(self.marks)
-        coloured_rings = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
-        for index, light_rings in enumerate(masks_of(self.marks).values()):
-            coloured_rings += [(ring, _COLOURS[2 + index % (len(_COLOURS) - 2)]) for ring in light_rings]
-        closed_rings = [([*ring, *ring[:1]], colour) for ring, colour in coloured_rings]
-        rows = [([x for x, _ in ring], [y for _, y in ring], colour) for ring, colour in closed_rings]
-        self._rings.data = columns("xs ys colour", rows)
-        self._on_change()
-
-    def _receive_marks(self) -> None:
-        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
-
-        A polygon's number is that of the present hole; a round hole is complete with two marks.
-        """
-        previous_keys, marks = {mark.key for mark in self.marks}, list[Mark]()
-        for mark in self._canvas.current_marks:
-            kind, number = mark.kind, self._hole
-            if kind == "round hole":
-                number = 1 + sum(earlier.kind.startswith("round hole ") for earlier in marks) // HOLES["round hole"]
-            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
-            marks.append(replace(mark, kind=kind))
-        if tuple(marks) != self.marks:
-            self.take_marks(
-                keep_one_outline(marks, next((mark.kind for mark in marks if mark.key not in previous_keys), ""))
-            )
-
-    def take_marks(self, marks: tuple[Mark, ...]) -> None:
-        """Take marks as a step that can be undone, and draw their lines."""
-        self._steps.record(marks)
-        self._canvas.place_marks(marks)
-        if not self._redraw_pending:
-            self._redraw_pending = True
-            self._document.add_timeout_callback(self.settle, VIEWER.mark_ms)
 
 
 class SetupControls(Controls):

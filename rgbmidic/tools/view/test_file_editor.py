@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -20,9 +18,9 @@ from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.results import Result
 from rgbmidic.results.files import write_text
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
-from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.url_state import Mark
+from rgbmidic.settings import FrameSettings, TestSettings, read_section, read_toml
+from rgbmidic.tools.view.drawing import masks_of
+from rgbmidic.tools.view.marks import Mark
 
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
@@ -258,111 +256,3 @@ class Confirmation:
         )
         self._pending = request
         return f"{', '.join(modification_times)} exists: press again to replace {subject}." if request else ""
-
-
-OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
-"""Kinds of an outline and the marks that it takes at least: opposite corners; corners; the centre and a place on it."""
-HOLES = {"hole": 3, "round hole": 2}
-"""Kinds of a hole, whose marks have its number too, and the marks that it takes at least."""
-MASK = "mask"
-"""Kind of a polygon in which a light does not count; its marks have its number and the light too."""
-SHAPES = {**OUTLINES, **HOLES, MASK: 3}
-"""All kinds of shapes and the marks that they take at least."""
-
-Ring = list[list[float]]
-
-
-def keep_one_outline(marks: Sequence[Mark], new_kind: str) -> tuple[Mark, ...]:
-    """Return the marks after one of the kind `new_kind` was set: there is one outline, of the kind drawn last."""
-    if new_kind not in OUTLINES:
-        return tuple(marks)
-    remaining = [mark for mark in marks if mark.kind == new_kind or mark.kind not in OUTLINES]
-    of_kind = [mark for mark in remaining if mark.kind == new_kind]
-    if new_kind != "polygon" and len(of_kind) > OUTLINES[new_kind]:  # a third place begins another one
-        remaining = [mark for mark in remaining if mark.kind != new_kind or mark is of_kind[-1]]
-    return tuple(remaining)
-
-
-def region_section(draft: Draft, marks: Sequence[Mark]) -> dict[str, Any]:
-    """Return the keys of ``[region]`` for what is drawn; without an outline a mask that is stated stays."""
-    outline, holes, stored = region_of(marks), [*_complete_shapes(marks, HOLES).values()], draft.section("region")
-    keys = {"mask": None if outline else stored.get("mask"), "holes": holes or None, **(outline or {})}
-    return {"rectangle": None, "polygon": None, **keys} if stored or any(keys.values()) else {}
-
-
-def _shape(mark: str) -> str:
-    """Return the kind of shape that a kind of marks makes: they may have its number, and a light."""
-    return next(shape for shape in SHAPES if mark.startswith(shape))
-
-
-def _complete_shapes(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
-    """Return the corners of the complete shapes of some kinds, by the kind of their marks.
-
-    They are rounded to a tenth of a pixel: a pointer's precision.
-    """
-    corners_by_kind = {}
-    for kind in dict.fromkeys(mark.kind for mark in marks):
-        points = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
-        if _shape(kind) in shapes and len(points) >= SHAPES[_shape(kind)]:
-            if _shape(kind) in ("circle", "round hole"):
-                (x, y), rim_point = points[:2]
-                radius, corners = math.dist((x, y), rim_point), VIEWER.circle_corners
-                angles = np.arange(corners) * 2 * np.pi / corners
-                points = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
-            corners_by_kind[kind] = [[round(float(x), 1), round(float(y), 1)] for x, y in points]
-    return corners_by_kind
-
-
-def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
-    """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
-    outline, holes = _complete_shapes(marks, OUTLINES), [*_complete_shapes(marks, HOLES).values()]
-    if not outline:
-        return None
-    (kind, corners), *_ = outline.items()
-    low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
-    shape: dict[str, Any] = {"rectangle": [*low, *high]} if kind == "rectangle" else {"polygon": corners}
-    return {**shape, **({"holes": holes} if holes else {})}
-
-
-def check_complete(marks: Sequence[Mark]) -> None:
-    """Check that no outline, hole or mask lacks marks.
-
-    Raises
-    ------
-    ConfigurationError
-        One does: it would be left out.
-    """
-    for kind, count in Counter(mark.kind for mark in marks).items():
-        if count < (min_count := SHAPES[_shape(kind)]):
-            raise ConfigurationError(f"the {kind} needs {min_count} marks or more and has {count}: finish or remove it")
-
-
-def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
-    """Return the corners of the outline, as far as it is drawn, and of the complete holes."""
-    region, holes = region_of(marks) or {}, [*_complete_shapes(marks, HOLES).values()]
-    if "rectangle" in region:
-        x0, y0, x1, y1 = region["rectangle"]
-        return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], holes
-    return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], holes
-
-
-def marks_of_region(draft: Draft) -> tuple[Mark, ...]:
-    """Return the marks that make the region of a draft; none for a mask."""
-    if not (content := draft.section("region")):
-        return ()
-    region = read_section(RegionSettings, "region", content, draft.file.parent)
-    if region.rectangle is not None:
-        x0, y0, x1, y1 = region.rectangle
-        outline = [Mark("rectangle", x0, y0), Mark("rectangle", x1, y1)]
-    else:
-        outline = [Mark("polygon", x, y) for x, y in region.polygon or ()]
-    holes = [Mark(f"hole {number + 1}", x, y) for number, hole in enumerate(region.holes) for x, y in hole]
-    return (*outline, *holes)
-
-
-def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
-    """Return the corners of the complete masks of each light that has some."""
-    by_light: dict[str, list[Ring]] = {}
-    for kind, ring in _complete_shapes(marks, [MASK]).items():
-        by_light.setdefault(kind.split(" ", 2)[2], []).append(ring)
-    return by_light

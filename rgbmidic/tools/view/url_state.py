@@ -5,164 +5,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
 
-import bokeh.models as bk
-
 from rgbmidic.fields import MEASURES, Units
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.tools.view.constants import VIEWER
+from rgbmidic.tools.view.controls import BACKGROUNDS, CONTROLS
+from rgbmidic.tools.view.marks import MARKS, SCALE, Mark, common_gauge, marks_of_probes
 
-KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
-"""Probes that can be set with the pointer, and how many places each takes."""
-SCALE = "scale"
-MARKS = (*KINDS, SCALE)
-"""Kinds of marks: those of probes, and two points of a known distance."""
-BACKGROUNDS = ("reference", "deformed")
 EXTRA_FIELDS = ("second", "third", "fourth")
 """Entries of the view that name fields beside the first."""
 UNCERTAINTY = "uncertainty"
 """Name of the field beside the first that is its standard uncertainty, whatever that is."""
-PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twilight")
-"""Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
-_CLOCKS = {"offset": "an offset", "trigger": "a trigger", "correlation": "correlation"}
-CLOCKS = tuple(_CLOCKS)
-"""Ways to relate the time of channels to that of the frames."""
-_RANGES = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A place on the reference that belongs to a probe.
-
-    Attributes
-    ----------
-    kind
-        One of `MARKS`; those that take two places take marks of their kind in pairs.
-    x, y
-        Place in px on the reference.
-    name
-        Name of the probe of which it is the first mark; empty: its kind and number.
-    key
-        The same for a mark that is moved or renamed, however many have its values.
-    """
-
-    kind: str
-    x: float
-    y: float
-    name: str = ""
-    key: object = field(default_factory=object, compare=False, repr=False, kw_only=True)
-
-
-class UndoHistory:
-    """Marks, which can be undone and done again; the moves of a mark that is dragged are one step.
-
-    Parameters
-    ----------
-    now
-        Marks at first.
-
-    Attributes
-    ----------
-    now
-        The marks.
-    """
-
-    def __init__(self, marks: tuple[Mark, ...]) -> None:
-        self.marks, self._past, self._future, self._moved_mark = marks, list[Any](), list[Any](), -1
-
-    def record(self, marks: tuple[Mark, ...]) -> None:
-        """Take marks as a step."""
-        changed_indices = [
-            index for index, states in enumerate(zip(self.marks, marks, strict=False)) if states[0] != states[1]
-        ]
-        is_single_change = len(marks) == len(self.marks) and len(changed_indices) == 1
-        moved_index = (
-            changed_indices[0]
-            if is_single_change
-            and replace(marks[changed_indices[0]], x=0, y=0) == replace(self.marks[changed_indices[0]], x=0, y=0)
-            else -1
-        )
-        if moved_index < 0 or moved_index != self._moved_mark:
-            self._past = [*self._past[-VIEWER.undo_steps :], self.marks]
-        self.marks, self._future, self._moved_mark = marks, [], moved_index
-
-    def step(self, *, back: bool) -> tuple[Mark, ...]:
-        """Return to the marks before the last step, or do again the one that was undone last."""
-        source, target = (self._past, self._future) if back else (self._future, self._past)
-        if source:
-            target.append(self.marks)
-            self.marks, self._moved_mark = source.pop(), -1
-        return self.marks
-
-
-def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
-    """Return the marks of each complete probe by its name, else kind and number: those of a kind in the order set."""
-    marks_by_name: dict[str, list[Mark]] = {}
-    for kind, count in KINDS.items():
-        of_kind = [mark for mark in marks if mark.kind == kind]
-        for number in range(len(of_kind) // count):
-            name = of_kind[number * count].name
-            has_default_name = not name or name in marks_by_name
-            marks_by_name[f"{kind}_{number + 1}" if has_default_name else name] = of_kind[
-                number * count : (number + 1) * count
-            ]
-    return marks_by_name
-
-
-def probe_position(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
-    """Return the numbers that place the probe of some marks, as ``[probes]`` has them; strain gauges of a length."""
-    coordinates = [coordinate for mark in marks for coordinate in (mark.x, mark.y)]
-    if marks[0].kind == "strain_gauge":
-        return (*coordinates, gauge)
-    if marks[0].kind == "circle":
-        return (*coordinates[:2], math.dist(coordinates[:2], coordinates[2:]))
-    return tuple(coordinates)
-
-
-def settings_of_marks(
-    marks: Sequence[Mark], gauge: float, defaults: ProbeSettings, measure: Any = None
-) -> ProbeSettings:
-    """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
-
-    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `defaults`.
-    """
-    positions: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
-    names = []
-    for name, group in probe_marks(marks).items():
-        positions[f"{group[0].kind}s"] += (probe_position(group, gauge),)
-        if name == group[0].name:
-            names.append((f"{group[0].kind}_{len(positions[f'{group[0].kind}s'])}", name))
-    return ProbeSettings(measure=measure or defaults.measure, window=defaults.window, names=tuple(names), **positions)
-
-
-def marks_of_probes(settings: ProbeSettings) -> tuple[Mark, ...]:
-    """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
-    marks, names = [], dict(settings.names)
-    for default_name, (kind, position) in zip(settings.labels, settings.kind_coordinates, strict=True):
-        if kind not in KINDS:
-            continue
-        x, y, *second_point = position
-        marks.append(Mark(kind, x, y, names.get(default_name, "")))
-        if KINDS[kind] > 1:
-            marks.append(
-                Mark(kind, x + second_point[0], y) if kind == "circle" else Mark(kind, second_point[0], second_point[1])
-            )
-    return tuple(marks)
-
-
-def common_gauge(settings: ProbeSettings) -> float | None:
-    """Return the length of the strain gauges stated, 0 without any; None where they differ: a page has one for all."""
-    lengths = {length for *_, length in settings.strain_gauges} or {0.0}
-    return lengths.pop() if len(lengths) == 1 else None
-
-
-def view_entry(default: Any, widget: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
-    """Declare an entry of the view: its default, and widget, text and options of its control, which limit the value."""
-    return field(default=default, metadata={"control": (widget, text, options)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,54 +81,48 @@ class ViewState:
     """
 
     frame: int = 0
-    field: str = view_entry("u", bk.Select, "Field")
-    over: str = view_entry(BACKGROUNDS[0], options=BACKGROUNDS)
-    range: str = view_entry("frame", bk.Select, "Colours from", options=_RANGES)
-    low: float = view_entry(-1.0, bk.NumericInput, "lowest", mode="float")
-    high: float = view_entry(1.0, bk.NumericInput, "highest", mode="float")
-    symmetric: bool = view_entry(False, bk.Checkbox, "symmetric about 0")
-    directions: bool = view_entry(False, bk.Checkbox, "principal directions")
-    opacity: float = view_entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
-    second: str = view_entry("", bk.Select, "Second field")
-    third: str = view_entry("", bk.Select, "Third field")
-    fourth: str = view_entry("", bk.Select, "Fourth field")
-    palette: str = view_entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
-    levels: int = view_entry(256, bk.Spinner, "Number of colours", low=2, high=256)
-    hatched: bool = view_entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
-    vectors: bool = view_entry(False, bk.Checkbox, "displacement as arrows")
-    longer: float = view_entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
-    contours: bool = view_entry(False, bk.Checkbox, "contour lines")
-    extremes: bool = view_entry(False, bk.Checkbox, "smallest and largest value")
-    blank: bool = view_entry(False, bk.Checkbox, "nodes without data")
-    gauge: float = view_entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
-    measure: str = view_entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
-    since: int = view_entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
-    rigid: bool = view_entry(False, bk.Checkbox, "rigid motion removed")
-    rate_window: int = view_entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
-    curve: str = view_entry("")
-    along: str = view_entry("", bk.Select, "Along x")
-    channels: str = view_entry("", bk.TextInput, "CSV file beside the test")
-    clock: str = view_entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
-    offset: float = view_entry(0.0, bk.NumericInput, "Offset, s", mode="float")
-    trigger: str = view_entry("", bk.Select, "Trigger channel")
-    align: str = view_entry("", bk.Select, "Channel")
-    align_to: str = view_entry("", bk.Select, "alike to")
-    area: float = view_entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
-    force: str = view_entry("", bk.Select, "Force")
-    beside: str = view_entry("", bk.Select, "Beside the curves")
-    distance: float = view_entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
-    distance_std: float = view_entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
-    camera: str = view_entry("", bk.TextInput, "or camera")
-    line: str = view_entry("")
-    theme: str = view_entry("", options=("light", "dark"))
+    field: str = "u"
+    over: str = BACKGROUNDS[0]
+    range: str = "frame"
+    low: float = -1.0
+    high: float = 1.0
+    symmetric: bool = False
+    directions: bool = False
+    opacity: float = 0.85
+    second: str = ""
+    third: str = ""
+    fourth: str = ""
+    palette: str = ""
+    levels: int = 256
+    hatched: bool = False
+    vectors: bool = False
+    longer: float = 0.0
+    contours: bool = False
+    extremes: bool = False
+    blank: bool = False
+    gauge: float = 0.0
+    measure: str = MEASURES[0]
+    since: int = -1
+    rigid: bool = False
+    rate_window: int = 0
+    curve: str = ""
+    along: str = ""
+    channels: str = ""
+    clock: str = "offset"
+    offset: float = 0.0
+    trigger: str = ""
+    align: str = ""
+    align_to: str = ""
+    area: float = 0.0
+    force: str = ""
+    beside: str = ""
+    distance: float = 0.0
+    distance_std: float = 0.0
+    camera: str = ""
+    line: str = ""
+    theme: str = ""
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()
-
-    @classmethod
-    def controls(cls) -> dict[str, tuple[type[bk.Widget], str, dict[str, Any]]]:
-        """Return kind, text and options of the controls, by the entries that they set."""
-        controls = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
-        return {name: control for name, control in controls.items() if control[0] is not None}
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
@@ -320,7 +171,7 @@ class ViewState:
         if self.channels or settings.file is None:
             return self
         align, align_to = settings.align or ("", "")
-        clock = CLOCKS[1] if settings.trigger else CLOCKS[2] if settings.align else CLOCKS[0]
+        clock = "trigger" if settings.trigger else "correlation" if settings.align else "offset"
         keys: dict[str, Any] = {"clock": clock, "offset": settings.offset, "area": settings.area or 0.0}
         keys |= {"trigger": settings.trigger or "", "align": align, "align_to": align_to, "force": settings.force or ""}
         return replace(self, channels=str(settings.file), **keys)
@@ -375,7 +226,7 @@ def _format_entry(value: object) -> str:
 
 def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
     """Return the value that a text states for an entry; None where it is invalid."""
-    _, _, options = entry.metadata.get("control", (None, "", {}))
+    options = CONTROLS[entry.name].options if entry.name in CONTROLS else {}
     try:
         if isinstance(entry.default, bool):
             return bool(int(text))
@@ -396,12 +247,9 @@ def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
         return None
     if entry.name in ("field", *EXTRA_FIELDS):
         return text if text in names or (text == UNCERTAINTY and entry.name in EXTRA_FIELDS) else None
-    if "options" in options:
-        return (
-            text
-            if text in [option if isinstance(option, str) else option[0] for option in options["options"]]
-            else None
-        )
+    choices = {"over": BACKGROUNDS, "theme": ("light", "dark")}.get(entry.name, options.get("options"))
+    if choices is not None:
+        return text if text in [choice if isinstance(choice, str) else choice[0] for choice in choices] else None
     return text[: VIEWER.address_letters]
 
 

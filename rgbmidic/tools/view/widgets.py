@@ -1,10 +1,10 @@
-"""What all pages have: controls, the scripts that run in the browser, errors that are shown, work beside the page."""
+"""What all pages have: a player of the frames, scripts of the browser, errors that are shown, work beside the page."""
 
 from __future__ import annotations
 
 import html
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.resources import files
 from typing import Any, TypeVar
@@ -12,12 +12,11 @@ from typing import Any, TypeVar
 import bokeh.models as bk
 from bokeh.core.properties import Int, String
 from bokeh.document import Document
-from bokeh.layouts import column, row
+from bokeh.layouts import row
 from bokeh.model import DataModel
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.tools.view.constants import VIEWER
-from rgbmidic.tools.view.url_state import ViewState
 
 logger = logging.getLogger(__name__)
 
@@ -156,89 +155,3 @@ class Controls:
         self.frame.js_on_change("value", request)
         self.play.js_on_change("active", request)
         state.js_on_change("displayed_frame", request)
-
-
-SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
-    "Field": ("field", "second", "third", "fourth", "over", "opacity", "print"),
-    "Colours": ("range", ("low", "high"), "lock", "symmetric", "palette", "levels", "hatched"),
-    "Layers": ("directions", "contours", "extremes", "blank", "vectors", "longer"),
-    "Derived": ("gauge", "measure", "since", "rigid", "rate_window"),
-    "Probes": ("mode", ("curve", "along"), ("probe", "name"), ("undo", "redo", "clear"), ("csv", "png"), "message"),
-    "Channels": ("channels", ("beside", "clock"), "trigger", ("align", "align_to"), "offset", "drag", ("force", "area"),
-                 "channel_status"),
-    "File": ("scale", ("distance", "distance_std", "camera"), "scale_label", "file", "sections_to_write",
-             ("write", "load_probes"), "save_status"),
-}  # fmt: skip
-"""Controls of a result by the section under which they stand, some in one row: one section is shown at a time, and fits
-a screen of 720 rows."""
-WRITABLE_SECTIONS = ("probes", "channels", "scale")
-"""Sections of a TEST.toml that the page can write."""
-MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
-
-
-class ResultControls(Controls):
-    """Controls of the page of a result, with nothing chosen yet; parameters as `Controls`.
-
-    Attributes
-    ----------
-    entry_controls : dict
-        The control of each entry of the view.
-    """
-
-    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
-        super().__init__(last_frame, frame, dark=dark)
-        wide, self.entry_controls = self.wide, dict[str, Any]()
-        for entry, (widget, text, options) in ViewState.controls().items():
-            name = {"field": "quantity"}.get(entry, entry)
-            text_key, look = ("label", self.small) if widget is bk.Checkbox else ("title", wide)
-            self.entry_controls[entry] = widget(name=name, **{text_key: text}, **options, **look)
-        self.over = self.group("over", "image", ["over the reference", "over the frame"], active=None)
-        self.section = self.group("section", "controls shown", SECTIONS)
-        self.mode = self.group("mode", "what a click sets", MODES)
-        self.scale = self.group("scale", "points of the scale", ["Move", "Two points of a distance"], active=None)
-        look = {"html_attributes": aria_group("sections that are written"), **wide}
-        self.sections_to_write = bk.CheckboxButtonGroup(
-            labels=list(WRITABLE_SECTIONS), active=[0], name="sections_to_write", **look
-        )
-        self.curve, self.probe = (bk.Select(title=text, name=text.lower(), **wide) for text in ("Curve", "Probe"))
-        self.name = bk.TextInput(title="its name", name="name", **wide)
-        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", value="TEST.toml", **wide)
-        self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
-        self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
-        folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
-        look = {"styles": folded, "html_attributes": LIVE_REGION, **self.small}
-        self.movie_status = bk.Div(name="movie_status", width=300, visible=False, **look)
-        self.player = row(self.play, self.step, self.frame, self.movie, self.movie_status, sizing_mode="stretch_width")
-        labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
-        self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.load_probes = (
-            bk.Button(label=name, name=name.lower(), **wide) for name in labels
-        )
-        self.print = bk.Button(label="Save PNG for print", name="print", **wide)
-        texts = ("pointer_label", "channel_status", "save_status", "scale_label")
-        self.pointer_label, self.channel_status, self.save_status, self.scale_label = (
-            bk.Div(name=name, **wide) for name in texts
-        )
-
-    @property
-    def side(self) -> Any:
-        """The column of all controls, of which one section is shown."""
-        flat, models = {"sizing_mode": "stretch_width"}, {**vars(self), **self.entry_controls}
-        section_columns: list[Any] = []
-        for names in SECTIONS.values():
-            section_models = [
-                models[name] if isinstance(name, str) else row(*map(models.get, name), **flat) for name in names
-            ]
-            section_columns.append(column(*section_models, visible=not section_columns, **flat))
-        self.section.js_on_change("active", script("turnTo", group=self.section, sections=section_columns))
-        return column(self.description, self.section, *section_columns, self.theme, **flat)
-
-    def wire(self, state: SharedState, tools: Sequence[Any], frame_mark: bk.Span) -> None:
-        """Let the browser itself act; `frame_mark` marks the frame that is shown."""
-        self.request_frames(state)
-        for name in ("displayed_frame", "query"):
-            state.js_on_change(name, script("showFrame", state=state, now=frame_mark))
-        state.js_on_change("csv", script("keepCsv", state=state))
-        state.js_on_change("png", script("keepPng", state=state))
-        groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
-        for group, group_tools, other_group in groups:
-            group.js_on_change("active", script("choose", group=group, tools=list(group_tools), other=other_group))

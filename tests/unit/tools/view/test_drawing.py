@@ -15,10 +15,11 @@ from small_tests import grey_frame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.settings import read_test
 from rgbmidic.tools.view.canvas import Canvas
+from rgbmidic.tools.view.drawing import RegionDrawing, region_of
+from rgbmidic.tools.view.marks import Mark
 from rgbmidic.tools.view.setup import SetupPage
-from rgbmidic.tools.view.setup_panel import DraftFrames, RegionDrawing
-from rgbmidic.tools.view.test_file_editor import Confirmation, Draft, region_of
-from rgbmidic.tools.view.url_state import Mark
+from rgbmidic.tools.view.setup_panel import DraftFrames
+from rgbmidic.tools.view.test_file_editor import Confirmation, Draft
 
 RECTANGLE = (Mark("rectangle", 10, 10), Mark("rectangle", 60, 60))
 CORNERS = [[12.0, 10.0], [135.0, 12.0], [130.0, 105.0], [15.0, 100.0]]

@@ -30,24 +30,15 @@ from rgbmidic.text import format_value, format_with_std
 from rgbmidic.tools.report.painter import ImageWindow, Overlay, paint, palette
 from rgbmidic.tools.report.style import time_axis
 from rgbmidic.tools.view import curves
+from rgbmidic.tools.view.controls import CLOCKS, PALETTES, ResultControls
 from rgbmidic.tools.view.curves import CurvePanel
 from rgbmidic.tools.view.fields import FieldsInView, element_at, palette_name, range_over_test, robust_range
-from rgbmidic.tools.view.map_panel import LabelLayer, arrow_lines, contour_lines, place_texts
+from rgbmidic.tools.view.layers import LabelLayer, arrow_lines, contour_lines, place_texts
+from rgbmidic.tools.view.marks import MARKS, Mark, UndoHistory, marks_of_probes, probe_marks, settings_of_marks
 from rgbmidic.tools.view.page import ResultPage
 from rgbmidic.tools.view.time_line import FrameProgress, TimeLine
-from rgbmidic.tools.view.url_state import (
-    CLOCKS,
-    MARKS,
-    PALETTES,
-    UNCERTAINTY,
-    Mark,
-    UndoHistory,
-    ViewState,
-    marks_of_probes,
-    probe_marks,
-    settings_of_marks,
-)
-from rgbmidic.tools.view.widgets import ResultControls, is_watched
+from rgbmidic.tools.view.url_state import UNCERTAINTY, ViewState
+from rgbmidic.tools.view.widgets import is_watched
 
 NAMES = ("u", "v", "e1")
 
@@ -83,7 +74,7 @@ looks = st.builds(
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
     channels=st.text("abc /.ä", max_size=9),
-    clock=st.sampled_from(CLOCKS),
+    clock=st.sampled_from(list(CLOCKS)),
     offset=st.floats(-1e9, 1e9),
     marks=named,
 )
@@ -185,11 +176,11 @@ def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
     (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
     page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), FrameProgress(4))
     page.update_view()
-    assert "span 5 to 13 s" in page.controls.channel_status.text
+    assert "span 5 to 13 s" in page.controls["channel_status"].text
     assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
-    page.controls.entry_controls["offset"].value = -5.0
-    assert "has no value in" not in page.controls.channel_status.text
-    page.controls.entry_controls["area"].value = 2.0
+    page.controls["offset"].value = -5.0
+    assert "has no value in" not in page.controls["channel_status"].text
+    page.controls["area"].value = 2.0
     np.testing.assert_allclose(page.curves.histories["stress"].values, 0.5 * 2e-5 * np.arange(4), atol=1e-15)
     page._save()
     assert page.state.csv.splitlines()[0] == "frame,number,status,time_s,a_N,stress_MPa"
@@ -586,11 +577,11 @@ class Walk:
             page.state.requested_frame = choose.randrange(8)
         elif what == "field":
             still = [name for name in page.fields.maps.quantities if not any(word in name for word in TIMED)]
-            parts.entry_controls["field"].value = choose.choice(still)
+            parts["field"].value = choose.choice(still)
         elif what == "over":
-            parts.over.active = choose.randrange(2)
+            parts["over"].active = choose.randrange(2)
         elif what == "range":
-            parts.entry_controls["range"].value = choose.choice(["frame", "test"])
+            parts["range"].value = choose.choice(["frame", "test"])
         else:
             self.store.write_frame(choose.randrange(8), smooth_record(choose.randrange(1, 9)))
             page._grow()
@@ -659,24 +650,24 @@ def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), FrameProgress(2))
     page.update_view()
     present = page.maps.canvas.colours.low, page.maps.canvas.colours.high
-    page.controls.entry_controls["range"].value = "hand"
+    page.controls["range"].value = "hand"
     assert (page.view.low, page.view.high) == present
-    page.controls.entry_controls["low"].value = 5.0
+    page.controls["low"].value = 5.0
     assert f"The colours go from {present[0]:g} to {present[1]:g}" in page.controls.description.text
-    page.controls.entry_controls["high"].value = 9.0
+    page.controls["high"].value = 9.0
     assert "The colours go" not in page.controls.description.text
     assert (page.maps.canvas.colours.low, page.maps.canvas.colours.high) == (5, 9)
 
 
 def test_a_choice_that_cannot_be_is_told_and_the_next_one_counts(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), FrameProgress(2))
-    page.controls.entry_controls["gauge"].value = 5.0
+    page.controls["gauge"].value = 5.0
     assert "at least 56.12 px long" in page.controls.description.text
     assert not page._has_view
-    page.controls.entry_controls["gauge"].value = 70.0
-    page.controls.entry_controls["field"].value = "exx"
+    page.controls["gauge"].value = 70.0
+    page.controls["field"].value = "exx"
     assert "virtual strain gauge of 70 px" in page.controls.description.text
-    page.controls.entry_controls["field"].value = "velocity"
+    page.controls["field"].value = "velocity"
     assert "rates need 4 measured frames or more; there are 2" in page.controls.description.text
 
 
@@ -699,16 +690,14 @@ def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(t
     page = ResultPage(Document(), made, ViewState(frame=1), FrameProgress(2))
     page.update_view()
     before = page.fields.values("u").values
-    page.controls.entry_controls["camera"].value = "camera.json"
+    page.controls["camera"].value = "camera.json"
     assert page.maps.canvas.plot.title.text == "u (mm)"
-    assert ("u", "u (mm)") in [
-        tuple(pair) for group in page.controls.entry_controls["field"].options.values() for pair in group
-    ]
+    assert ("u", "u (mm)") in [tuple(pair) for group in page.controls["field"].options.values() for pair in group]
     np.testing.assert_allclose(page.fields.values("u").values, 0.5 * before, atol=1e-9)
-    page.controls.entry_controls["camera"].value = "none.json"
-    assert "none.json" in page.controls.scale_label.text
+    page.controls["camera"].value = "none.json"
+    assert "none.json" in page.controls["scale_label"].text
     assert page.maps.canvas.plot.title.text == "u (mm)"
-    page.controls.entry_controls["camera"].value = ""
+    page.controls["camera"].value = ""
     assert page.maps.canvas.plot.title.text == "u (px)"
 
 

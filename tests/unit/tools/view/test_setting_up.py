@@ -12,18 +12,12 @@ import pytest
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, read_test
+from rgbmidic.tools.view.drawing import keep_one_outline, marks_of_region, masks_of, region_of
+from rgbmidic.tools.view.marks import Mark
 from rgbmidic.tools.view.panels import probe_section, scale_section
 from rgbmidic.tools.view.setup import SetupPage
 from rgbmidic.tools.view.setup_panel import SetupControls
-from rgbmidic.tools.view.test_file_editor import (
-    Confirmation,
-    Draft,
-    keep_one_outline,
-    marks_of_region,
-    masks_of,
-    region_of,
-)
-from rgbmidic.tools.view.url_state import Mark
+from rgbmidic.tools.view.test_file_editor import Confirmation, Draft
 
 TEXT = """# a test of the plate
 [frames]  # as recorded
@@ -122,7 +116,7 @@ def test_drawn_shapes_are_the_region_that_is_read_again():
         "holes": [[[40, 10], [50, 10], [50, 20]]],
     }
     draft = Draft(file=Path("TEST.toml"), text="").with_values({"region": content})
-    assert region_of(marks_of_region(draft)) == content
+    assert region_of(marks_of_region(draft.section("region"), draft.file.parent)) == content
 
 
 def test_a_round_hole_has_the_area_of_its_circle():
