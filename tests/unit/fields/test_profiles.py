@@ -31,13 +31,12 @@ def wave(noise: float, seed: int) -> np.ndarray:
 
 def along(field: str, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The field u or exx and its uncertainty along the line, (T, P)."""
-    std, nothing, read = np.full(len(MESH.nodes), noise * np.sqrt(2)), np.zeros(len(MESH.nodes)), []
-    for u in wave(noise, seed):
-        if field == "u":
-            read.append(LINE.read(u, std))
-        else:
-            strain = GAUGES.strain(u, nothing, std, std, measure="engineering")
-            read.append(LINE.read(strain.components[:, 0], strain.components_std[:, 0], "exx"))
+    std = np.full(len(MESH.nodes), noise * np.sqrt(2))
+    strain_std = GAUGES.strain(0 * std, 0 * std, std, std, measure="engineering").components_std[:, 0]
+    read = [
+        LINE.read(u, std) if field == "u" else LINE.read(GAUGES.slopes[0] @ u, strain_std, "exx")
+        for u in wave(noise, seed)
+    ]
     return np.array([pair[0] for pair in read]), np.array([pair[1] for pair in read])
 
 
