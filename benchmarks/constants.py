@@ -40,8 +40,8 @@ VARIED = {
     "statistics": ("freedom", "least_variance", "independent_fraction"),
 }
 """Constants of each part of the method."""
-QUICK = ("least_variance", "sigma")
-"""One of each part."""
+QUICK = ("sigma",)
+"""Of `--quick`: the window of all sums over blocks."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
 COARSE = {"smoothness": 10, "anchor": 10, "weight_tolerance": 100, "voters": 10, "tolerance": 100}

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+import rgbmidic
 from rgbmidic.typing import AnyArray, FloatArray
 
 from . import ROOT
@@ -153,10 +154,11 @@ def peers_python(names: Sequence[str]) -> tuple[str, list[str]]:
     return python, list(names)
 
 
-def environment() -> dict[str, str]:
-    """One thread, and this checkout first."""
+def environment(python: str) -> dict[str, str]:
+    """One thread, and this checkout first; but this Python's own package, whose kernels are compiled."""
     variables = ("RGBMIDIC_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "calibration")))
+    package = Path(rgbmidic.__file__).parents[1] if python == sys.executable else ROOT
+    path = os.pathsep.join(map(str, (package, ROOT, ROOT / "calibration")))
     return {**os.environ, **dict.fromkeys(variables, "1"), "PYTHONPATH": path}
 
 
@@ -169,8 +171,8 @@ def displacements(
         for number, (f, g, placing) in enumerate(pairs.values()):
             np.savez(folder / f"{number}.npz", f=f, g=g, placing=(*placing.region, placing.size, placing.step))
         subprocess.run(
-            [python, "-m", "benchmarks.contenders", name, str(folder)], env=environment(), cwd=folder, check=False,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            [python, "-m", "benchmarks.contenders", name, str(folder)],
+            env=environment(python), cwd=folder, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         found: dict[str, Points | None] = {}
         for number, pair in enumerate(pairs):

@@ -250,7 +250,7 @@ class Contender:
         # in the temporary folder: some contenders leave files where they run
         self._process = subprocess.Popen(
             [python, "-m", "benchmarks.peers", name, str(folder)],
-            env=environment(), cwd=folder, text=True,
+            env=environment(python), cwd=folder, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 

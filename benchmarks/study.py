@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator
 from typing import Any
 
-import draws
 import numpy as np
-from renders import renders
+from renders import kept
 
-from causes import VARIATIONS, find_causes
+from causes import VARIATIONS, Cause, find_causes
 from claims import judge
 from measurement import METHODS
 from run import run_paper_study
@@ -22,14 +20,17 @@ SMALL, FEW = 448, (1.0, 8.0)
 """Frames (px) and angles (degrees) of the tables, and of `--quick`."""
 
 
+@kept
 def bench_study(quick: bool) -> Any:
-    """The study, kept beside the renders for the tables that are made of it."""
-    path = renders() / f"study_{quick:d}_{draws.current}.pickle"
-    if not path.exists():
-        scenes = {"size": SMALL, "scenes": ("sequential",)} if quick else {"size": SIZE}
-        study = run_paper_study(FEW if quick else ANGLES, causes=False, **scenes)
-        path.write_bytes(pickle.dumps(study))
-    return pickle.loads(path.read_bytes())
+    """The study, kept for the tables that are made of it."""
+    scenes = {"size": SMALL, "scenes": ("sequential",)} if quick else {"size": SIZE}
+    return run_paper_study(FEW if quick else ANGLES, causes=False, **scenes)
+
+
+@kept
+def small_cause(number: int) -> Cause:
+    """One of the `VARIATIONS` in small frames at 8 degrees."""
+    return find_causes((8.0,), size=SMALL, variations=[VARIATIONS[number]])[0]
 
 
 def _text(words: str) -> str:
@@ -97,8 +98,7 @@ def claims(quick: bool) -> Iterator[dict[str, object]]:
 def causes(quick: bool) -> Iterator[dict[str, object]]:
     """P (1e-3 px) in the reflection and far from it by the paper's DIC and GLC-DIC with one parameter changed at a
     time, one lamp, frames of 512 px."""
-    some = {"size": SMALL, "variations": [VARIATIONS[0]]} if quick else {}
-    for cause in find_causes((8.0,) if quick else (1.0, 8.0), **some):
+    for cause in [small_cause(0)] if quick else find_causes((1.0, 8.0)):
         row: dict[str, object] = {"change": _text(cause.title)}
         for number, method in enumerate(("DIC", "GLC-DIC")):
             for angle, inside, outside in zip(cause.angles, cause.inside[number], cause.outside[number], strict=True):

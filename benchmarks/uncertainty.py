@@ -34,6 +34,7 @@ from .uncertainty_scenes import (
     Setting,
     both,
     frame,
+    glare_of,
     images_of,
     pair_of,
     turn,
@@ -112,14 +113,15 @@ def true_strain(pair: Pair, nodes: FloatArray) -> FloatArray:
     return at_nodes(np.stack([dx[0], dy[1], (dy[0] + dx[1]) / 2]), nodes)
 
 
-def reflecting(pair: Pair, solution: Solution) -> BoolArray:
+def reflecting(setting: Setting, solution: Solution) -> BoolArray:
     """Nodes at which, in one of the states, a reflection makes up more than a third of a light's local mean."""
+    pair, (first, second) = pair_of(setting), glare_of(setting)
     mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
     there = at_pixels(mesh, at_nodes(pair.exact, solution.nodes), (pair.size, pair.size))
     y, x = np.mgrid[: pair.size, : pair.size].astype(np.float32)
-    bright = pair.glare[0].max(axis=0) > REFLECTION
-    for second in pair.glare[1]:
-        warped = cv2.remap(second, np.nan_to_num(x + there[0]), np.nan_to_num(y + there[1]), cv2.INTER_LINEAR)
+    bright = first.max(axis=0) > REFLECTION
+    for light in second:
+        warped = cv2.remap(light, np.nan_to_num(x + there[0]), np.nan_to_num(y + there[1]), cv2.INTER_LINEAR)
         bright |= warped > REFLECTION
     column, row = np.round(solution.nodes).astype(int).T
     return np.asarray(bright[row, column])
@@ -177,13 +179,14 @@ def sphere(quick: bool) -> Iterator[Row]:
         for angle in ANGLES[1::2] if quick else ANGLES:
             size = 256 if quick else 640
             paints = {"speckle": speckle, **PAINTS[paint]}
-            pair = pair_of(Setting(body="sphere", state=turn(angle), size=size, lateral_colour=LENS, **paints))
+            setting = Setting(body="sphere", state=turn(angle), size=size, lateral_colour=LENS, **paints)
+            pair = pair_of(setting)
             solution = solve_pair(pair, both(pair, KINDS[camera], crosstalk=crosstalk))
             verdict = Verdict.of(solution, pair)
             errors[f"{angle:g}° [px]"] = verdict.rms
             ratios.append(verdict.ratio)
             strains.append(verdict.strain_ratio)
-            inside.append(reflecting(pair, solution))
+            inside.append(reflecting(setting, solution))
         ratio, strain, reflection = (np.concatenate(parts) for parts in (ratios, strains, inside))
         yield {
             "camera": camera,

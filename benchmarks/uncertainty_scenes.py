@@ -73,11 +73,10 @@ class Setting:
 
 @dataclass(frozen=True)
 class Pair:
-    """Noise-free lights (k, H, W) in both states, fraction of their local mean that is not diffuse, and the truth."""
+    """Noise-free lights (k, H, W) in both states, and the truth."""
 
     scene: Scene
     lights: tuple[FloatImage, FloatImage]
-    glare: tuple[FloatImage, FloatImage]
     exact: FloatArray
 
     def cut(self, top: int, left: int, size: int) -> Pair:
@@ -85,8 +84,7 @@ class Pair:
         part = (slice(None), slice(top, top + size), slice(left, left + size))
         camera = replace(self.scene.camera, shape=(size, size))
         first, second = (image[part] for image in self.lights)
-        shine, later = (image[part] for image in self.glare)
-        return Pair(replace(self.scene, camera=camera), (first, second), (shine, later), self.exact[part])
+        return Pair(replace(self.scene, camera=camera), (first, second), self.exact[part])
 
     @property
     def size(self) -> int:
@@ -96,15 +94,19 @@ class Pair:
 
 @lru_cache(maxsize=8)
 def pair_of(setting: Setting) -> Pair:
-    """Render a setting, its mat twin and its truth."""
-    scene, mat = setting.scene(), setting.scene(gloss=0.0)
-    states = (None, setting.state)
-    lights = [render(scene, state) for state in states]
-    glare = [
-        np.asarray(1 - blurred(render(mat, one)) / np.maximum(blurred(full), 1), dtype=np.float32)
-        for one, full in zip(states, lights, strict=True)
+    """Render a setting and its truth."""
+    scene = setting.scene()
+    return Pair(scene, (render(scene), render(scene, setting.state)), truth(scene, setting.state))
+
+
+@lru_cache(maxsize=8)
+def glare_of(setting: Setting) -> list[FloatImage]:
+    """Fraction of the lights' local mean (k, H, W) that is not diffuse, in both states: its mat twin lacks it."""
+    mat, states = setting.scene(gloss=0.0), (None, setting.state)
+    return [
+        np.asarray(1 - blurred(render(mat, state)) / np.maximum(blurred(lights), 1), dtype=np.float32)
+        for state, lights in zip(states, pair_of(setting).lights, strict=True)
     ]
-    return Pair(scene, (lights[0], lights[1]), (glare[0], glare[1]), truth(scene, setting.state))
 
 
 def blurred(images: FloatImage) -> FloatImage:
@@ -167,7 +169,7 @@ def overlapping_reflections() -> Pair:
     surface = replace(scene.surface, white=white, black=black)
     scene = replace(scene, surface=surface, lights=tuple(replace(light, position=place) for light in scene.lights))
     first, second = (render(scene, state) for state in (None, turn(1.0)))
-    return Pair(scene, (first, second), (first * 0, second * 0), truth(scene, turn(1.0)))
+    return Pair(scene, (first, second), truth(scene, turn(1.0)))
 
 
 def _off(lights: Any, zone: BoolArray, state: int) -> None:

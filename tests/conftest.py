@@ -11,12 +11,15 @@ from contextlib import ExitStack, nullcontext
 import pytest
 import real_files
 from draws import JITTER, SAMPLERS, other_draws
+from hypothesis import HealthCheck, settings
 from kernels_of_tests import compiled_in_background
 from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
 from rgbmidic.tools import report
 
+settings.register_profile("on any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("on any machine")
 _compilation = ExitStack()
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 

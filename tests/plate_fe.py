@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
+from renders import kept
 from results import make_result
 from scipy.sparse.linalg import spsolve
 from textures import Texture
@@ -117,8 +119,9 @@ class Plate:
         return texture.at(*material.T).reshape(SHAPE)
 
 
+@kept
 def compared_plates(
-    folder: Path, *, draws: int, moduli: Sequence[float], texture: int = 3, element_size: float = 30
+    *, draws: int, moduli: Sequence[float], texture: int = 3, element_size: float = 30
 ) -> dict[float, list[FrameComparison]]:
     """Compare pairs of noisy photographs of a plate with its simulation, and with one whose modulus is a multiple."""
     plate, painted, random = Plate.of(10), Texture.random(texture, waves=150), np.random.default_rng(1)
@@ -140,10 +143,11 @@ def compared_plates(
         return FrameRecord.from_values(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
-    result = make_result(folder / "result", frames=draws, record=record, **mesh)
     simulation = Simulation(mesh=plate.mesh, displacement=plate.displacement[None])
     made = {}
-    for modulus in moduli:
-        wrong = replace(simulation, displacement=simulation.displacement / modulus)
-        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).iterate())
+    with tempfile.TemporaryDirectory() as folder:
+        result = make_result(Path(folder) / "result", frames=draws, record=record, **mesh)
+        for modulus in moduli:
+            wrong = replace(simulation, displacement=simulation.displacement / modulus)
+            made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).iterate())
     return made

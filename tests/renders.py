@@ -1,4 +1,5 @@
-"""Renders that the tests of a run, or its tables, have in common: kept in a folder by the description of the scene."""
+"""What the tests of a run, or its tables, have in common: renders, kept in a folder by the description of the scene,
+and results of functions, by their arguments."""
 
 from __future__ import annotations
 
@@ -7,11 +8,13 @@ import os
 import pickle
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
+import draws
 import numpy as np
 
 from rgbmidic.tools.lab.virtual import rendering
@@ -49,6 +52,22 @@ def new_renders() -> Iterator[None]:
         yield
     finally:
         rendering._trace = before
+
+
+def kept(make: Callable[..., Any]) -> Callable[..., Any]:
+    """Keep what a function gives beside the renders, for the same arguments and draws of the noise."""
+
+    @wraps(make)
+    def found(*arguments: Any, **options: Any) -> Any:
+        described = pickle.dumps((make.__module__, make.__name__, draws.current, arguments, sorted(options.items())))
+        path = renders() / f"{hashlib.sha1(described).hexdigest()}.pickle"
+        if not path.exists():
+            temporary = path.with_suffix(f".{os.getpid()}.pickle")
+            temporary.write_bytes(pickle.dumps(make(*arguments, **options)))
+            temporary.replace(path)
+        return pickle.loads(path.read_bytes())
+
+    return found
 
 
 def _found(*scene_and_state: Any) -> Any:

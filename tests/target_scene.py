@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 from scipy.special import erf
@@ -31,8 +33,23 @@ def imaged(points, where, lens=LENS):
 
 def on_plane(pixels, where, lens=LENS):
     """The inverse of `imaged`."""
+    return _traced(undistorted(lens, pixels), where, lens)
+
+
+def frame_on_plane(where, lens=LENS):
+    """`on_plane` at all pixels of the frame, row by row."""
+    return _traced(_undistorted_frame(tuple(lens)), where, lens)
+
+
+@cache
+def _undistorted_frame(lens):
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    return undistorted(np.array(lens), np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
+
+
+def _traced(pixels, where, lens):
     rotation, shift = where
-    rays = np.c_[(undistorted(lens, pixels) - lens[1:3]) / lens[0], np.ones(len(pixels))]
+    rays = np.c_[(pixels - lens[1:3]) / lens[0], np.ones(len(pixels))]
     normal = rotation[:, 2]
     return ((rays * ((normal @ shift) / (rays @ normal))[:, None] - shift) @ rotation)[:, :2]
 
@@ -57,9 +74,7 @@ def random_views(random, count=10, lens=LENS, tilt=25.0, noise=NOISE):
 
 def photo(where, random=None, blur=0.9, level=180.0, lens=LENS, target=TARGET):
     """Photograph of a chessboard, its edges blurred by `blur` px, with noise of one grey level."""
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    places = on_plane(np.stack([x.ravel(), y.ravel()], axis=1).astype(float), where, lens)
-    places += target.points.mean(axis=0)
+    places = frame_on_plane(where, lens) + target.points.mean(axis=0)
     width = blur * DISTANCE / lens[0] * np.sqrt(2)
 
     def wave(place):

@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Callable
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from rgbmidic.cli import app as cli
 from rgbmidic.cli import before as cli_before
 from rgbmidic.cli.command import execute
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.tools import report
 from rgbmidic.tools.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic.tools.lab.virtual import rendering
 from rgbmidic_calibration import cli as calibrate
@@ -203,23 +205,42 @@ def accept(text):
     TestSettings.from_mapping({"frames": {"path": "frames/*.dng"}, **document})
 
 
+def commands(text):
+    """Program and arguments of each command of a block."""
+    for line in text.replace("\\\n", " ").replace("&&", "\n").splitlines():
+        if words := shlex.split(line, comments=True):
+            yield words
+
+
+DRAWN = {
+    tuple(words[:2]): page
+    for page in PAGES
+    for mark, language, text in blocks(page)
+    if language == "bash" and not mark.startswith("not run")
+    for words in commands(text)
+}
+"""The last page on which a command runs: there its pictures are drawn, else blank ones are written."""
+
+
 @contextmanager
 def blank_pictures():
-    """Reports of a batch are those that `report` draws on other pages; here their figures are made but not drawn."""
+    """Maps are not made, other figures are made but not drawn: most of the time of commands is that of pictures."""
     savefig = Figure.savefig
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(Figure((1, 1)), *to, **how))
+        patch.setattr(report, "write_figures", lambda *_, **__: [])
+        for maps in ("fields", "strip"):
+            patch.setattr(report.MapDrawer, maps, lambda *_, **__: Figure((1, 1)))
         yield
 
 
-def run_commands(text, capsys):
+def run_commands(text, page, capsys):
     programs = {"rgbmidic": cli.app, "rgbmidic-calibrate": calibrate.app}
-    for line in text.replace("\\\n", " ").replace("&&", "\n").splitlines():
-        if words := shlex.split(line, comments=True):
-            program, *arguments = words
-            arguments = [part.replace("60,60,390,390", "60,60,260,260") for part in arguments]  # smaller files here
-            with blank_pictures() if arguments[0] == "batch" else nullcontext():
-                assert execute(programs[program], arguments) == 0, (arguments, capsys.readouterr().err)
+    for program, *arguments in commands(text):
+        is_drawn = DRAWN[program, arguments[0]] == page and arguments[0] != "batch"  # which writes reports
+        arguments = [part.replace("60,60,390,390", "60,60,260,260") for part in arguments]  # smaller files here
+        with nullcontext() if is_drawn else blank_pictures():
+            assert execute(programs[program], arguments) == 0, (arguments, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
@@ -240,7 +261,7 @@ def test_the_blocks_of_a_page_run_as_written(page, demo, tmp_path, monkeypatch, 
         elif language == "python":
             exec(compile(text, page, "exec"), names)
         elif language == "bash":
-            run_commands(text, capsys)
+            run_commands(text, page, capsys)
         elif language == "toml":
             accept(text)
         else:
@@ -270,6 +291,12 @@ def reachable(home, parts):
     return True
 
 
+@cache
+def public_names():
+    """Names of the public modules, and what they are."""
+    return [(name, found) for _, name, found in reference.public()]
+
+
 def exists(words):
     """Whether `package.module.name` or `Class.name` is there."""
     first, *parts = words.split(".")
@@ -277,8 +304,7 @@ def exists(words):
         for count in range(len(parts), -1, -1):
             with suppress(ImportError):
                 return reachable(import_module(".".join([first, *parts[:count]])), parts[count:])
-    homes = [found for _, name, found in reference.public() if name == first]
-    return any(reachable(home, parts) for home in homes)
+    return any(reachable(found, parts) for name, found in public_names() if name == first)
 
 
 NO_NAMES = ("rgbmidic.frame_formats", "Competitor.prepare")
@@ -312,7 +338,8 @@ DOCTESTS = [path for path in PACKAGES if ">>> " in path.read_text(encoding="utf-
 def test_the_examples_of_the_docstrings_run(path, demo, monkeypatch):
     monkeypatch.chdir(demo)
     name = path.relative_to(ROOT).with_suffix("").as_posix().removeprefix("calibration/").replace("/", ".")
-    with np.printoptions(legacy=False):  # whatever other tests have imported
+    blank = blank_pictures() if path.stem in ("document", "gallery") else nullcontext()
+    with np.printoptions(legacy=False), blank:  # whatever other tests have imported
         found = doctest.testmod(import_module(name))
     assert found.attempted
     assert not found.failed

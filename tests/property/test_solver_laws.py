@@ -17,7 +17,7 @@ FINE = {"tolerance": 1e-5, "prefilter": "binomial", "element_size": 22}
 SAME = 2e-3
 """Displacements (px) that differ by single precision and by where the iteration stopped only."""
 
-few = settings(max_examples=6, deadline=None)
+few = settings(max_examples=6)
 seeds = st.integers(0, 2**32 - 1)
 shifts = st.tuples(st.floats(-3, 3), st.floats(-3, 3))
 

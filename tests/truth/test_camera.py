@@ -13,7 +13,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from target_scene import LENS, SHAPE, imaged, on_plane, pose, random_views, view_of
+from target_scene import LENS, SHAPE, frame_on_plane, imaged, on_plane, pose, random_views, view_of
 from textures import Texture
 
 from rgbmidic import CameraCalibration, measure
@@ -100,8 +100,7 @@ def largest_error(result: Result, exact: tuple[float, float], scale: ScaleSettin
     return float(max(np.nanmax(np.abs(values[name] - true)) for name, true in zip(("e1", "e2"), exact, strict=True)))
 
 
-@pytest.mark.parametrize("tilt", [0.0, 2.0, 5.0])
-@pytest.mark.parametrize("percent", [-2.0, 0.0, 2.0])
+@pytest.mark.parametrize(("percent", "tilt"), [(0.0, 0.0), (2.0, 0.0), (0.0, 2.0), (2.0, 5.0), (-2.0, 5.0)])
 def test_strain_on_the_plane_is_right_where_in_pixels_it_is_not(tmp_path: Path, percent: float, tilt: float) -> None:
     where, lens = pose(0.8 * tilt, 0.6 * tilt), lens_of(percent)
     calibrated(where, lens, seed=int(10 * tilt + percent) + 2).write(tmp_path / "camera.json")
@@ -252,8 +251,7 @@ def test_another_camera_takes_its_place_and_contradictions_are_refused(
 def test_speckle_on_a_tilted_specimen_is_measured_without_its_false_strain(tmp_path: Path) -> None:
     """Images through lens and plane, from the pixel to the strain."""
     where, lens, texture = pose(4, 3), lens_of(2), Texture.random(1, waves=60)
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    places = on_plane(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64), where, lens)
+    places = frame_on_plane(where, lens)
     motion = np.array([1.0, -0.7])
     for index, points in enumerate((places, places - motion)):
         image = texture.at(*(points.T * LENS[0] / where[1][2])).reshape(SHAPE)

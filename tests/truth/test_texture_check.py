@@ -35,7 +35,7 @@ def correlation(state: np.ndarray) -> float:
 @pytest.mark.parametrize("diameter", [2.0, 3.0, 4.7])
 def test_what_is_refused_cannot_be_measured_and_what_is_warned_of_is_poor(diameter):
     found = {}
-    for contrast in (0.3, 0.5, 0.7, 1.5):
+    for contrast in (0.3, 0.5, 1.5):
         first, second = pair(diameter, contrast)
         solution = correlate(first, second, prefilter="binomial", initial=(0.3, -0.2))
         error = np.sqrt(np.nanmean((solution.displacement - SHIFT) ** 2)) if solution.measured.any() else np.nan

@@ -231,8 +231,10 @@ def _saturated(lights: np.ndarray) -> None:
     lights[1, :, : SIZE // 3] *= 6
 
 
-@pytest.mark.parametrize("kind", ["rgb", "bayer"])
-@pytest.mark.parametrize("spoil", [_off, _flicker, _fragment, _glare, _saturated])
+@pytest.mark.parametrize(
+    ("spoil", "kind"),
+    [(_off, "rgb"), (_flicker, "bayer"), (_fragment, "bayer"), (_glare, "rgb"), (_saturated, "bayer")],
+)
 def test_what_is_spoiled_is_flagged_and_spoils_nothing_else(sphere: Sphere, kind: str, spoil: object) -> None:
     reference, deformed = sphere.lights[0.0], sphere.lights[1.0].copy()
     spoil(deformed)  # type: ignore[operator]

@@ -485,7 +485,7 @@ def test_installed_command_ends_with_the_status_and_without_traceback(tmp_path: 
     code = "from rgbmidic.cli.app import main; main()"
     for extra, traces in (([], False), (["--debug"], True)):
         done = subprocess.run(
-            [sys.executable, "-c", code, "run", "none.toml", "--out", str(tmp_path / "out"), *extra],
+            [sys.executable, "-P", "-c", code, "run", "none.toml", "--out", str(tmp_path / "out"), *extra],
             capture_output=True,
             text=True,
         )
@@ -531,7 +531,9 @@ def test_the_first_run_says_that_kernels_are_compiled(
 def test_kernels_are_not_compiled_where_the_cache_is_empty(tmp_path: Path) -> None:
     code = "from rgbmidic._kernels import are_compiled; print(are_compiled())"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, env=environment, check=True
+    )
     assert done.stdout.strip() == "False"
 
 

@@ -32,7 +32,7 @@ LACKS = {
 def test_no_part_imports_what_only_another_needs() -> None:
     steps = [f"import {part}; print(*{lacks!r} & sys.modules.keys(), sep=', ')" for part, lacks in LACKS.items()]
     code = "\n".join(["import sys", *steps])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     assert dict(zip(LACKS, done.stdout.split("\n"), strict=False)) == dict.fromkeys(LACKS, "")
 
 

@@ -280,7 +280,7 @@ _settings = st.builds(
 )
 
 
-@examples(max_examples=40, deadline=None)
+@examples(max_examples=40)
 @given(settings=_settings)
 def test_settings_come_back_from_their_plain_form(settings: TestSettings) -> None:
     document: dict[str, dict[str, Any]] = settings.to_mapping()

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 import run
-from causes import VARIATIONS, find_causes
 from claims import judge
 from measurement import METHODS, PaperStudy
 
 sys.path.append(str(Path(__file__).resolve().parents[3]))
 
 from benchmarks.study import FEW as ANGLES
-from benchmarks.study import bench_study
+from benchmarks.study import bench_study, small_cause
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +154,7 @@ def test_the_study_uses_public_names_only(script):
 
 def test_brightness_disturbs_plain_dic_and_roughness_defeats_the_grey_level_correction():
     """Paint without relief and wrinkles that reflects as much on average: the same P by DIC, hardly any by GLC-DIC."""
-    rough, smooth = find_causes((8.0,), size=448, variations=[VARIATIONS[0], VARIATIONS[5]])
+    rough, smooth = small_cause(0), small_cause(5)
     assert "no wrinkles" in smooth.title
     plain, corrected = rough.inside[:, 0], smooth.inside[:, 0]
     assert corrected[0] == pytest.approx(plain[0], rel=0.35)

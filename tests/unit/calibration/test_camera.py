@@ -13,7 +13,7 @@ import pytest
 from real_files import RealData
 from scipy.spatial import cKDTree
 from scipy.special import erf
-from target_scene import LENS, SHAPE, TARGET, imaged, on_plane, photo, pose, random_views, view_of
+from target_scene import LENS, SHAPE, TARGET, frame_on_plane, imaged, on_plane, photo, pose, random_views, view_of
 
 from rgbmidic.cli import command
 from rgbmidic.errors import CalibrationError, ConfigurationError
@@ -97,8 +97,7 @@ def test_corners_that_opencv_finds_a_pixel_off_are_mended() -> None:
 
 def discs(where, target, radius, random):
     """Photograph of a grid of circles with blurred edges."""
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    places = on_plane(np.stack([x.ravel(), y.ravel()], axis=1).astype(float), where) + target.points.mean(axis=0)
+    places = frame_on_plane(where) + target.points.mean(axis=0)
     away = cKDTree(target.points).query(places)[0].reshape(SHAPE)
     slope = np.hypot(*np.gradient(away))
     image = 120 + 85 * erf((away - radius) / np.maximum(slope, 1e-3) / 1.3)

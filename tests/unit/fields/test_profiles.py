@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,13 +41,12 @@ def series(values: np.ndarray, std: np.ndarray) -> Field:
 
 def along(field: str, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The field u or exx and its uncertainty along the line, (T, P)."""
-    std, nothing, read = np.full(len(MESH.nodes), noise * np.sqrt(2)), np.zeros(len(MESH.nodes)), []
-    for u in wave(noise, seed):
-        if field == "u":
-            read.append(LINE.read(nodal(u, std)))
-        else:
-            strain = GAUGES.strain(Displacement.in_plane(u, nothing, std, std), "engineering")
-            read.append(LINE.read(strain["exx"], "exx"))
+    std = np.full(len(MESH.nodes), noise * np.sqrt(2))
+    strain = GAUGES.strain(Displacement.in_plane(0 * std, 0 * std, std, std), "engineering")["exx"]
+    read = [
+        LINE.read(nodal(u, std)) if field == "u" else LINE.read(replace(strain, values=GAUGES.slopes[0] @ u), "exx")
+        for u in wave(noise, seed)
+    ]
     return np.array([one.values for one in read]), np.array([one.std for one in read])
 
 

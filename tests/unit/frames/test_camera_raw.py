@@ -118,7 +118,7 @@ def test_kodak_with_a_non_ascii_name(real_data: RealData) -> None:
 
 
 @given(share=st.floats(0, 1, exclude_max=True))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_truncated_dng_is_refused_at_any_length(dng: Path, share: float) -> None:
     content = dng.read_bytes()
     path = dng.with_name("cut.dng")
@@ -279,7 +279,7 @@ def test_dng_with_a_tiff_name_is_read_as_dng(dng: Path) -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_damaged_header_never_gives_another_error(dng: Path, seed: int) -> None:
     random = np.random.default_rng(seed)
     content = bytearray(dng.read_bytes())

@@ -308,7 +308,7 @@ def test_a_jpeg_in_a_tiff_that_libjpeg_fills_up_is_refused(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["plain.tif", "zip.tif", "lzw.tif", "grey.png"])
 @given(share=st.floats(0, 1, exclude_max=True))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_truncated_file_is_refused_or_read_whole(whole: dict[str, Path], name: str, share: float) -> None:
     content = whole[name].read_bytes()
     cut = whole[name].with_name(f"cut_{name}")
@@ -321,7 +321,7 @@ def test_a_truncated_file_is_refused_or_read_whole(whole: dict[str, Path], name:
 
 
 @given(position=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_changed_byte_in_a_png_is_noticed(whole: dict[str, Path], position: float, flip: int) -> None:
     content = bytearray(whole["grey.png"].read_bytes())
     content[int(position * len(content))] ^= flip

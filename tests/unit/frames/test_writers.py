@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(mosaic=mosaics())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_dng_written_and_read_is_the_same_frame(folder: Path, mosaic: Mosaic) -> None:
     write_dng(folder / "frame.dng", mosaic)
     back = read_frame(folder / "frame.dng")
@@ -56,7 +56,7 @@ def test_white_balance_reaches_viewers(tmp_path: Path) -> None:
 
 
 @given(mosaic=mosaics())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_tiff_mosaic_written_and_read_is_the_same(folder: Path, mosaic: Mosaic) -> None:
     write_tiff(folder / "mosaic.tif", mosaic)
     back = read_frame(folder / "mosaic.tif", cfa=mosaic.cfa, white_level=mosaic.white_level)
@@ -65,7 +65,7 @@ def test_tiff_mosaic_written_and_read_is_the_same(folder: Path, mosaic: Mosaic) 
 
 
 @given(frame=channel_frames())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_tiff_channels_written_and_read_are_the_same(folder: Path, frame: ChannelFrame) -> None:
     write_tiff(folder / "channels.tif", frame)
     back = read_frame(folder / "channels.tif", kind="monochrome" if len(frame.values) == 1 else "rgb")

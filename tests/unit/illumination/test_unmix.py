@@ -26,7 +26,7 @@ def channels_of(lights, matrix, valid=None):
     return LinearChannels(values=values.astype(np.float32), valid=valid, full_scale=4000.0)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     k=st.integers(1, 3),
     seed=st.integers(0, 2**32 - 1),

@@ -137,7 +137,9 @@ def said(value):
         "from rgbmidic._kernels.threads import threads\ntry: print(threads())\nexcept Exception as error: print(error)"
     )
     environment = {**os.environ, "RGBMIDIC_THREADS": value}
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment).stdout.strip()
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, env=environment
+    ).stdout.strip()
 
 
 def test_the_environment_sets_the_number():

@@ -143,7 +143,7 @@ def test_without_a_crack_nodes_are_their_own_places():
 
 
 @given(ends=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 300)), min_size=2, max_size=4, unique=True))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_any_path_gives_a_sound_mesh_or_one_clear_error(ends):
     try:
         mesh = Tri3Mesh.from_region(REGIONS["rectangle"], SIZE, [ends])

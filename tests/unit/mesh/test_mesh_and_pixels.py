@@ -122,7 +122,7 @@ def covered_by(mesh, point):
     top=st.floats(0, 3),
     size=st.floats(4, 30),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_any_rectangle_is_covered_once(width, height, left, top, size):
     shape = (height + 5, width + 5)
     region = Region.from_rectangle((left, top, left + width, top + height), shape)
@@ -134,7 +134,7 @@ def test_any_rectangle_is_covered_once(width, height, left, top, size):
 
 
 @given(seed=st.integers(0, 2**32 - 1), outlined=st.booleans())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_owners_equal_the_naive_twin(seed, outlined):
     random = np.random.default_rng(seed)
     shape = (int(random.integers(18, 30)), int(random.integers(18, 30)))

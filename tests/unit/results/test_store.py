@@ -30,7 +30,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_record_written_and_read_is_the_same(store: ResultStore, seed: int) -> None:
     record = random_record(seed)
     store.write_frame(0, record)
@@ -161,7 +161,7 @@ def test_a_growing_result_is_seen_to_grow(tmp_path: Path) -> None:
 
 
 @given(share=st.floats(0, 1, exclude_max=True))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_truncated_file_loses_its_frame_only(five: Path, share: float) -> None:
     file = five / "solution" / "000003.npz"
     content = file.read_bytes()

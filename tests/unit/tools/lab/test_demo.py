@@ -37,7 +37,8 @@ def test_a_measurement_compiles_nothing_that_the_small_measurements_have_not(tmp
     """But for the renderer, which makes this test's frames."""
     tests = str(Path(__file__).parents[3])
     script = f"import sys; sys.path.insert(0, {tests!r})\n{_REST}"
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True)
+    # -P: not the package of a clone in whose folder this runs, whose kernels lie elsewhere
+    done = subprocess.run([sys.executable, "-P", "-c", script, tmp_path], capture_output=True, text=True, check=True)
     number, *more = done.stdout.split()
     assert int(number) > 15
     assert more == ["trace_rows"]

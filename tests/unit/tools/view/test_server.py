@@ -50,7 +50,7 @@ def address(tmp_path_factory):
 def ask(address, method, path, headers=None):
     """Status and body of the answer to a request that need not keep the rules."""
     parts = urlsplit(address)
-    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=300)
     try:
         connection._validate_path = lambda url: None
         connection.request(method, path, headers=headers or {})
