@@ -338,7 +338,7 @@ def iterate(problem: Problem, equations: Equations, residual: Residual, estimate
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         if last_longest == np.inf:
-            tolerance = max(tolerance, 0.02 * longest)
+            tolerance = max(tolerance, 0.03 * longest)
         # nodes that wander where nothing matches do not keep the others waiting
         most = np.quantile(estimate.increments[-1][equations.textured], 0.9)
         if longest <= tolerance or (longest > last_longest / 2 and most <= tolerance):

@@ -99,16 +99,15 @@ def initial_weighting(problem: Problem, estimate: Estimate, residual: Residual |
 def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Estimate) -> Weighting:
     """Compare the states at an estimate: which elements match, and how much each light counts.
 
-    The precision of the lights, and what the reference is compared by, are learnt anew where the nodes have moved: what
-    several lights alike show of the motion hides which of them is the precise one.
+    The precision of the lights, and what the reference is compared by, are learnt anew where the nodes have moved. As
+    long as they stay, elements may leave but not take part again: at a fragment's edge some would come and go.
     """
     constants, displacement = problem.constants, estimate.displacement
     if last.learnt_at is not None:
         motion = np.hypot(*(displacement - last.learnt_at).T)[equations.textured]
-        has_moved = (motion > constants.reweight_motion).mean() > constants.max_oscillating_fraction
-        if len(last.residual.weights) == 1 or not has_moved:
+        if np.sqrt((motion**2).mean()) <= constants.reweight_motion:
             residual = compare(problem, estimate, last.residual.reference)
-            matched = matching_elements(residual, displacement, last.precision)
+            matched = last.matched & matching_elements(residual, displacement, last.precision)
             return replace(last, residual=residual, matched=matched)
     residual = compare(problem, estimate, problem.reference.filtered_as(displacement))
     # of the residual that the displacement minimises: by other grey levels it is not yet the best
