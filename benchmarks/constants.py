@@ -31,9 +31,8 @@ from .tables import Row, table
 SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 VARIED = {
     "solver": (
-        *("smoothness", "longest_step", "patience", "anchor", "information_smoothing", "score_range", "prior_blocks"),
-        *("gain_window_factor", "outlier_factor", "min_isotropy", "max_noise_fraction", "min_initial_zncc"),
-        *("divergence_step", "max_oscillating_fraction", "weight_tolerance"),
+        *("smoothness", "information_smoothing", "score_range", "prior_blocks", "gain_window_factor", "outlier_factor"),
+        *("min_initial_zncc", "max_oscillating_fraction"),
     ),
     "window": ("sigma",),
     "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
@@ -44,7 +43,7 @@ QUICK = ("sigma",)
 """Of `--quick`: the window of all sums over blocks."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
-COARSE = {"smoothness": 10, "anchor": 10, "weight_tolerance": 100, "voters": 10, "tolerance": 100}
+COARSE = {"smoothness": 10, "voters": 10, "tolerance": 100}
 """Constants of which only the order of magnitude counts, and factors."""
 
 

@@ -169,7 +169,6 @@ class RigidMotions:
         hold: sp.csc_matrix,
         solve: Callable[[FloatArray], FloatArray],
         textured: BoolArray,
-        constants: SolverConstants,
     ) -> RigidMotions:
         """Find the equations of the rigid unknowns that are left when the displacement is eliminated.
 
@@ -187,8 +186,6 @@ class RigidMotions:
             Solves with ``M + H`` for (2 N, K).
         textured : ndarray, shape (E,), bool
             Elements with texture enough: what noise alone shows elsewhere counts for nothing.
-        constants
-            Of the solve.
         """
         lights, count = len(per_light), functions.shape[1]
         unit_modes = np.zeros((lights, lights - 1, len(functions), count))
@@ -216,8 +213,11 @@ class RigidMotions:
         # a complement under it is rounding (1e-13), or the hold of a constant between two bodies (1e-9)
         rounding = 1e-9
         observability, directions = eigh(energy(textured) / scale, total_energy + rounding * np.eye(len(unit)))
-        observable = directions[:, observability > constants.min_observability] / unit[:, None]
-        unknown = directions[:, observability <= constants.min_observability] * (border_diagonal > 0)[:, None]
+        # the images have .998 or more of it where lights see within one element of one another, .02 or less an element
+        # further apart (measured): the rest is the hold's, which holds no data
+        is_observable = observability > 0.5
+        observable = directions[:, is_observable] / unit[:, None]
+        unknown = directions[:, ~is_observable] * (border_diagonal > 0)[:, None]
         unknown = unknown / np.maximum(np.linalg.norm(unknown, axis=0), 1e-300)
         participation = (unknown**2).sum(axis=1).reshape(lights - 1, count).sum(axis=1)
         return cls(
@@ -225,7 +225,8 @@ class RigidMotions:
             relative_modes=relative_modes,
             coupling=border + held,
             inverse=observable @ np.linalg.inv(observable.T @ everywhere @ observable) @ observable.T,
-            unobservable=np.append(False, participation > constants.min_participation),
+            # the lights' fractions of a motion add up to 1: of up to ten lights one is named at least
+            unobservable=np.append(False, participation > 0.1),
         )
 
     def increment(self, free: FloatArray, held_side: FloatArray, rigid_side: FloatArray) -> FloatArray:
@@ -250,8 +251,13 @@ def block_side(pixels: PixelMap, element: float, constants: SolverConstants) -> 
     """Side (px) of the blocks for elements of side `element` (px); a small region has a few of them across."""
     return max(
         constants.min_block_side,
-        min(round(constants.block_side_per_element * element), min(pixels.bounds[2:]) // constants.min_blocks_across),
+        min(round(constants.block_side_per_element * element), min(pixels.bounds[2:]) // 4),  # of two 19 px are too few
     )
+
+
+_MIN_RESIDUAL_LEVERAGE = 0.05
+"""Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px leave
+.1)."""
 
 
 def mean_residual_leverage(
@@ -289,7 +295,8 @@ def mean_residual_leverage(
     """
     side = block_side(pixels, mesh.size, constants)
     rows, columns = pixels.grid(side)
-    stride = int(np.clip(np.ceil(2 * np.sqrt(constants.projected_blocks / (rows * columns))), 2, 4))
+    # of 700 blocks the random signs keep the projections apart to half a per cent of the fraction (derived)
+    stride = int(np.clip(np.ceil(2 * np.sqrt(700 / (rows * columns))), 2, 4))
     sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
     first_row, first_column, _, _ = pixels.bounds
     pixel_geometry = pixels.runs, pixels.run_offsets, pixels.origin - (first_column, first_row), pixels.barycentric
@@ -305,7 +312,7 @@ def mean_residual_leverage(
     projected = []
     for xx_to_yy in map(assembly.at_nodes, products):
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
-    sides, anchor = np.stack(projected, axis=1), constants.anchor * total / assembly.size
+    sides, anchor = np.stack(projected, axis=1), 1e-6 * total / assembly.size  # holds unknowns without texture
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
     solutions, ratio = solve(sides), 1.0
     if prefilter != "none":
@@ -326,7 +333,7 @@ def mean_residual_leverage(
         ratio = float(np.sqrt(np.prod([residual / motion for residual, motion in passed])))
     if not mesh.is_graded:
         fraction = 1 - float((sides * solutions).sum()) / total
-        return ratio * fraction if fraction > constants.min_residual_leverage else float("nan")
+        return ratio * fraction if fraction > _MIN_RESIDUAL_LEVERAGE else float("nan")
     fitted = (sides * solutions).reshape(len(mesh.nodes), -1).sum(axis=1)
     element_texture = np.ascontiguousarray(hessian[..., (0, 2)].sum(axis=(2, 3)).ravel())
     nodal_texture = np.bincount(mesh.elements.ravel(), weights=element_texture, minlength=len(mesh.nodes))
@@ -338,7 +345,7 @@ def mean_residual_leverage(
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     local_texture = np.maximum(smoothed_grids[1][row, column], np.finfo(float).tiny)
     local = 1 - smoothed_grids[0][row, column] / local_texture
-    return np.where(local > constants.min_residual_leverage, ratio * local, np.nan)
+    return np.where(local > _MIN_RESIDUAL_LEVERAGE, ratio * local, np.nan)
 
 
 def _passed(

@@ -15,84 +15,37 @@ class SolverConstants:
 
     Attributes
     ----------
-    first_pass_tolerance
-        Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration less
-        is needed, but from another initial guess the result differs by up to 2.3e-4 px (measured).
     min_initial_zncc
         Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
         nearer. Chosen; half or twice of it matters where images do not match alone: beside a hole, between two bodies
         and in a deep shadow, by .07 to .15 of the stated uncertainty.
-    max_reactivation_passes
-        Passes after each of which elements may take part again. Chosen: at a fragment's edge some come and go with
-        every pass, which costs iterations; after a single pass what a crack or another body pulls at first is left out
-        for good.
-    divergence_step
-        Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the
-        elements around a node are left out after `max_reactivation_passes` passes: its own pixels match nothing.
-        Chosen: ten times what ends the first pass.
     reweight_motion
-        Motion (px) of more than `max_oscillating_fraction` of the nodes from where the weights of several lights were
-        learnt, after which these are learnt once more: what all lights alike show of the motion hides which of them is
-        the precise one. Chosen: a hundredth of a speckle, which a residual still shows.
+        Rms motion (px) from where the weights of the lights were learnt, after which these are learnt anew: what all
+        lights alike show of the motion hides which of them is the precise one. With .03 errors on raised droplets are
+        as large, on coarse wrinkles by .4 % larger, with .1 px of any node in fifty by 4 % (measured).
     max_oscillating_fraction
-        Fraction of the nodes that may be left out at the end because they still move: a few at the rim of a fragment,
-        half of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen; half or
-        twice of it matters in a deep shadow and with rigid motions of the lights, by .15 of the stated uncertainty.
-    weight_tolerance
-        Fraction of the weight that may still change for the passes to end. Chosen; a hundredth or a hundred times of it
-        matter in a deep shadow only.
-    sample_count
-        That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
-        (derived).
-    max_passes
-        Most passes: each warps the weights with the latest displacement; `max_reactivation_passes`, and those that
-        refine after.
-    max_pass_iterations
-        Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests).
-    patience
-        Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or
-        faster with the weights of the next pass. Chosen; 2 or 6 matter in a deep shadow only.
-    max_overshoot
-        Part of an iteration's motion that the next one takes back, from which steps are shortened: with 1 they diverge,
-        and below .5 each halves the error (derived).
-    longest_step
-        Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's.
+        Fraction of the nodes that are not measured if they still move at the end: a few at the rim of a fragment, half
+        of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen; half or twice
+        of it matters in a deep shadow and with rigid motions of the lights, by .15 of the stated uncertainty.
     min_stretch_change, max_stretch_change
         Rms change of the inverse stretch ``C^-1 - 1`` (twice the strain) from which the reference is filtered as the
         deformed images are: at a strain of 5 % that takes an error of .0016 px, at half a per cent a tenth. Its
         largest change: a surface compressed to .45, beyond which the filter's first term does not hold. Chosen.
-    min_area_ratio
-        Area of a deformed surface over the square of its stretch (trace of C) from which its deformation gradient
-        carries the axes of the reference along, below it the rotation alone: what is 20 times as long as wide, or has
-        lost 19 parts in 20 of its area, is no match. Chosen.
     smoothness
         Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian.
         Chosen; with a tenth or ten times of it lights under a reflection differ by 2e-6 px at most, beside a gap by
         3e-4, nodes between two bodies by .3 of their stated uncertainty.
-    ridge
-        Multiple of the identity, relative to the same, that fixes the constant which the smoothness leaves free where
-        nothing is seen: 1e5 times less than the smoothness, 1e7 times more than rounding (derived).
-    rounding
-        Fraction of a node's texture below which that in its worse direction may be rounding: sums of some 1000 products
-        in single precision are uncertain by 1000 * 6e-8 at most (derived).
     min_texture
         A node counts as measured if it has this fraction of the median texture around a node of its area...
     min_information
         ...and this fraction of the median information, its texture over the variance of the residual: its noise is then
         10 times the median node's (derived).
-    texture_floor
-        Fraction of the largest texture below which a node has no part in that median: it is seen by no light, or blank.
     max_std
         Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match.
-    min_isotropy
-        Texture in the worse direction over that in the better one under which the former may be noise... Chosen; half
-        or twice of it matters beside a hole only, by .04 of the stated uncertainty.
-    max_noise_fraction
-        ...and is, if noise alone would give this fraction of it: displacements along it are 30 % too small (derived).
     zncc_bounds, zncc_bounds_precise
         Correlation coefficient under which the images of an element do not match, for poor images and for good ones:
         where the lights count alike, and where they count by their precision, so that a reflection in one of them is no
-        mismatch. Chosen.
+        mismatch. With the latter where they count alike two bodies that part are pulled together. Chosen.
     outlier_factor
         In between: how many times farther from 1 than the median of the elements around. Chosen; half or twice of it
         matters beside a hole, between two bodies and in a deep shadow only, by .08 to .2 of the stated uncertainty.
@@ -109,13 +62,6 @@ class SolverConstants:
     half_weight_displacement
         Displacement (px) of what a light alone shows against the solution at which it counts half in its gradient.
         With half or twice of it the error on coarse paint differs by 1 % (measured).
-    min_observability
-        Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the
-        hold's, which holds no data. Lights that see within one element of one another leave .998 or more to the images,
-        lights an element further apart .02 or less (measured).
-    min_participation
-        Least part of a light in a motion that the images do not show, by which the light is named: the parts of the
-        lights add up to 1 (derived), so that one of up to ten is named at least.
     min_gain_correlation
         Correlation of both states from which a light has a gain: a lamp that is off shows noise, whose contrast over
         the speckle's is none. Two states of one speckle have .9 and more; of 50 speckles chance makes .3 in 1 of 60
@@ -141,21 +87,10 @@ class SolverConstants:
         Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the
         error of 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times
         (DIC Challenge).
-    min_blocks_across
-        Blocks across a region from which they grow with the element: two of 19 px stated 1.8 times too much.
-    projected_blocks
-        Blocks, every other one in both directions, whose projections the random signs keep apart to half a per cent of
-        the fraction; where a region has fewer, those further apart are projected together, every fourth at most.
-    anchor
-        Multiple of the identity, over the texture of an unknown, that holds nodes without: it takes 1e-6 of the
-        projection of the others (derived).
     score_range
         Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to
         12 % (derived). With half or twice of it lights differ by 1e-3 px at most, beside a gap by 2e-3, their
         uncertainty by 5 %.
-    min_residual_leverage
-        Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px
-        leave 0.1).
     information_smoothing
         Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or
         twice of it lights differ by 1e-4 px at most, beside a gap by 2e-4, their uncertainty by 3 %.
@@ -181,35 +116,19 @@ class SolverConstants:
 
     Examples
     --------
-    >>> SolverConstants(max_passes=4).max_passes
-    4
+    >>> SolverConstants(smoothness=1e-3).smoothness
+    0.001
     """
 
-    first_pass_tolerance: float = 0.01
     min_initial_zncc: float = 0.25
-    max_reactivation_passes: int = 2
-    divergence_step: float = 0.1
-    reweight_motion: float = 0.05
+    reweight_motion: float = 0.02
     max_oscillating_fraction: float = 0.02
-    weight_tolerance: float = 1e-3
-    sample_count: int = 10_000
-    max_passes: int = 8
-    max_pass_iterations: int = 12
-    patience: int = 3
-    max_overshoot: float = 0.5
-    longest_step: float = 4.0
     min_stretch_change: float = 0.01
     max_stretch_change: float = 4.0
-    min_area_ratio: float = 0.05
     smoothness: float = 1e-4
-    ridge: float = 1e-9
-    rounding: float = 1e-4
     min_texture: float = 0.05
     min_information: float = 0.01
-    texture_floor: float = 1e-3
     max_std: float = 0.5
-    min_isotropy: float = 0.3
-    max_noise_fraction: float = 0.3
     zncc_bounds: tuple[float, float] = (0.4, 0.6)
     zncc_bounds_precise: tuple[float, float] = (0.4, 0.9)
     outlier_factor: float = 8.0
@@ -217,8 +136,6 @@ class SolverConstants:
     max_relative_stretch: float = 0.5
     gradient_correlation_bounds: tuple[float, float] = (0.85, 0.95)
     half_weight_displacement: float = 0.1
-    min_observability: float = 0.5
-    min_participation: float = 0.1
     min_gain_correlation: float = 0.3
     least_gain: float = 0.05
     gain_window_factor: float = 6.0
@@ -227,11 +144,7 @@ class SolverConstants:
     min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75
-    min_blocks_across: int = 4
-    projected_blocks: int = 700
-    anchor: float = 1e-6
     score_range: float = 30.0
-    min_residual_leverage: float = 0.05
     information_smoothing: float = 0.6
     prior_blocks: float = 0.1
     bias_range: float = 24.0

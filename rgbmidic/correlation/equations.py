@@ -34,7 +34,8 @@ class Equations:
 
     Attributes
     ----------
-    weights : ndarray, shape (k, P), float32
+    reference, weights
+        The reference state, and the pixel weights (k, P).
     deformation : ndarray, shape (N, 2, 2)
         Deformation gradient of the surface around each node.
     functions : ndarray, shape (2 N, m)
@@ -57,6 +58,7 @@ class Equations:
         Fraction of each light in what determines a node; 0 where nothing does.
     """
 
+    reference: Reference
     weights: FloatImage
     deformation: FloatArray
     functions: FloatArray
@@ -103,14 +105,16 @@ class Equations:
         blocks = np.sum(per_light, axis=0)
         node_blocks = assembly.node_blocks(blocks)
         min_fraction = constants.min_texture if prior_weights is None else constants.min_information
-        observability = _observability(node_blocks, assembly.nodal_area, min_fraction, constants)
+        observability = _observability(node_blocks, assembly.nodal_area, min_fraction)
         if prior_weights is not None:
             texture = assembly.node_blocks(np.sum(reference.hessians(prior_weights), axis=0))
-            texture_observability = _observability(texture, assembly.nodal_area, constants.min_texture, constants)
+            texture_observability = _observability(texture, assembly.nodal_area, constants.min_texture)
             observability = np.minimum(observability, texture_observability)
         diagonal, textured = (node_blocks[0] + node_blocks[2]) / 2, observability > 1
         scale = float(np.median(diagonal[textured]) if textured.any() else diagonal.max(initial=0.0)) or 1.0
-        held = scale * (constants.smoothness * assembly.smoothness.data + constants.ridge * assembly.diagonal)
+        # 1e-9 of the identity fixes the constant that the smoothness leaves free where nothing is seen: 1e5 times less
+        # than the smoothness, 1e7 times more than rounding
+        held = scale * (constants.smoothness * assembly.smoothness.data + 1e-9 * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
         hold = with_data(assembly.smoothness, held)
         mean_gradient = _mean_gradient(reference.mesh, blocks)
@@ -120,7 +124,7 @@ class Equations:
             # nodes without data have that of the others, carried along as a displacement is
             return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
 
-        deformation = _deformation(gradient(displacement), constants)
+        deformation = _deformation(gradient(displacement))
         size, count = functions.shape
         functions = _turned_back(deformation, functions.reshape(size // 2, 2, count)).reshape(size, count)
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
@@ -128,8 +132,9 @@ class Equations:
         rigid = None
         if functions.shape[1] and len(per_light) > 1:
             textured_elements = np.asarray(textured[reference.mesh.elements].all(axis=1))
-            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, textured_elements, constants)
+            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, textured_elements)
         return cls(
+            reference=reference,
             weights=weights,
             deformation=deformation,
             functions=functions,
@@ -212,11 +217,11 @@ def _mean_gradient(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray],
     return average
 
 
-def _deformation(gradient: FloatArray, constants: SolverConstants) -> FloatArray:
+def _deformation(gradient: FloatArray) -> FloatArray:
     """Deformation gradient (N, 2, 2), I + grad u; where that is nearly singular its rotation, the polar factor."""
     deformation = np.eye(2) + gradient
     square = np.maximum((deformation**2).sum(axis=(1, 2)), 1)
-    flat = np.linalg.det(deformation) < constants.min_area_ratio * square
+    flat = np.linalg.det(deformation) < 0.05 * square  # 20 times as long as wide, or of a 20th of its area: no match
     angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
     rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
@@ -227,9 +232,7 @@ def _turned_back(deformation: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj...->ni...", np.linalg.inv(deformation), vectors))
 
 
-def _observability(
-    node_blocks: FloatArray, area: FloatArray, min_fraction: float, constants: SolverConstants
-) -> FloatArray:
+def _observability(node_blocks: FloatArray, area: FloatArray, min_fraction: float) -> FloatArray:
     """Texture that the nodes see in their worse direction, over a fraction `min_fraction` of the median, (N,).
 
     It is the smaller eigenvalue of a node's own 2 x 2 block.
@@ -237,9 +240,11 @@ def _observability(
     xx, xy, yy = node_blocks
     half = (xx + yy) / 2
     smallest = half - np.hypot((xx - yy) / 2, xy)
-    smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
+    # texture in one direction only: sums of some 1000 products in single precision are uncertain by 1000 * 6e-8
+    smallest[smallest < 1e-4 * half] = 0
     density = smallest / area
-    typical = np.median(density[density > constants.texture_floor * density.max()]) if density.max() > 0 else 0.0
+    # nodes that no light sees, or that are blank, have no part in the median
+    typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
     return np.asarray(density / (min_fraction * typical) if typical > 0 else np.zeros_like(density))
 
 
@@ -285,6 +290,10 @@ class Estimate:
         return np.array([increment[nodes].max() for increment in self.increments], dtype=np.float64)
 
 
+_LONGEST_STEP = 4.0
+"""Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's."""
+
+
 class UnsolvableError(Exception):
     """Nothing can be measured: the reason, and how far the iteration came."""
 
@@ -293,27 +302,26 @@ class UnsolvableError(Exception):
         self.history = estimate.history()
 
 
-def compare(problem: Problem, estimate: Estimate) -> Residual:
-    """Return the residual at an estimate."""
-    return Residual.at(problem.reference, problem.deformed, _light_displacements(problem, estimate))
+def compare(problem: Problem, estimate: Estimate, reference: Reference | None = None) -> Residual:
+    """Return the residual at an estimate, with the problem's reference or one that has been adapted."""
+    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate))
 
 
 @stage("iteration")
-def iterate(
-    problem: Problem, equations: Equations, residual: Residual, estimate: Estimate, tolerance: float
-) -> Estimate:
-    """Iterate with one Hessian until no textured node moves by more than `tolerance`, or nine tenths of them do not.
+def iterate(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> Estimate:
+    """Iterate with one Hessian until no textured node moves by more than the tolerance, or those that do do not settle.
+
+    Where the first step is long, a fiftieth of it is enough: the weights change with the solution (an inexact Newton
+    method: Dembo, Eisenstat and Steihaug, SIAM J. Numer. Anal. 19, 1982).
 
     Parameters
     ----------
     problem, equations
-        What is solved, and the equations of the pass.
+        What is solved, and the equations.
     residual
         At the `estimate`.
     estimate
-        From which the pass begins.
-    tolerance
-        px.
+        From which the iteration begins.
 
     Raises
     ------
@@ -321,22 +329,24 @@ def iterate(
         The iteration diverged.
     """
     difference: FloatImage | None = residual.difference
-    constants, remaining = problem.constants, problem.options.max_iterations - len(estimate.increments)
-    relaxation, motion = 1.0, np.zeros_like(estimate.displacement)
-    for turn in range(min(constants.max_pass_iterations, remaining)):
-        before, last = estimate.displacement, motion
+    remaining, tolerance = problem.options.max_iterations - len(estimate.increments), problem.options.tolerance
+    relaxation, motion, longest = 1.0, np.zeros_like(estimate.displacement), np.inf
+    for _ in range(min(12, remaining)):  # from within half a speckle 4 to 5 do
+        before, last_motion, last_longest = estimate.displacement, motion, longest
         estimate = gauss_newton_step(problem, equations, residual.brightness, estimate, difference, relaxation)
-        difference, motion = None, estimate.displacement - before
-        # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken)
-        swing = float((motion * last).sum()) / max(float((last * last).sum()), 1e-30)
-        relaxation /= 1 - swing if swing < -constants.max_overshoot else 1
+        difference, motion, longest = None, estimate.displacement - before, estimate.longest
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
-        # a few nodes that wander where nothing matches must not keep the others waiting
-        steps = estimate.increments[-1][equations.textured]
-        nearly_converged = turn >= constants.patience and np.quantile(steps, 0.9) <= tolerance
-        if estimate.longest <= tolerance or nearly_converged:
+        if last_longest == np.inf:
+            tolerance = max(tolerance, 0.03 * longest)
+        # nodes that wander where nothing matches do not keep the others waiting
+        most = np.quantile(estimate.increments[-1][equations.textured], 0.9)
+        if longest <= tolerance or (longest > last_longest / 2 and most <= tolerance):
             break
+        # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken):
+        # from half of a step that the next one takes back each halves the error no longer
+        swing = float((motion * last_motion).sum()) / max(float((last_motion**2).sum()), 1e-30)
+        relaxation /= 1 - swing if swing < -0.5 else 1
     return estimate
 
 
@@ -358,7 +368,7 @@ def gauss_newton_step(
         shifts = shifts.reshape(rigid[1:].shape)
         rigid[1:] += shifts
         longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
-    bounded = motion * np.minimum(1.0, problem.constants.longest_step / np.maximum(length, 1e-30))[:, None]
+    bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
     return Estimate(
         displacement=estimate.displacement + bounded,
         rigid=rigid,
@@ -375,7 +385,7 @@ def _right_sides(
     estimate_difference: FloatImage | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
-    reference, assembly = problem.reference, problem.reference.assembly
+    reference, assembly = equations.reference, problem.reference.assembly
     held = equations.held_side(reference, estimate.displacement)
     total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):

@@ -63,17 +63,18 @@ def classify_nodes(
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
     """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise."""
-    (xx, xy, yy), constants = equations.node_blocks, residual.reference.constants
+    xx, xy, yy = equations.node_blocks
     half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     weak = half - difference
-    one_sided = np.asarray(equations.textured & (weak < constants.min_isotropy * (half + difference)))
+    one_sided = np.asarray(equations.textured & (weak < 0.3 * (half + difference)))
     if not one_sided.any():
         return one_sided
     angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
     x, y = np.cos(angle), np.sin(angle)
     noise_xx, noise_xy, noise_yy = _noise_blocks(residual, equations.weights, one_sided)
     along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
-    return np.asarray(one_sided & (along > constants.max_noise_fraction * weak))
+    # displacements along it are 30 % too small then
+    return np.asarray(one_sided & (along > 0.3 * weak))
 
 
 def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> FloatArray:

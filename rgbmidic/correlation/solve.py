@@ -1,15 +1,15 @@
-"""The MIDIC solve: Gauss-Newton on the weighted sum over the lights (paper, eq. 3), in passes with new weights.
+"""The MIDIC solve: Gauss-Newton on the weighted sum over the lights (paper, eq. 3), with weights from its residual.
 
 The unknowns are the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first,
 of the criterion ``sum_j sum_x p_j r_j(x)^2``. The residual r_j is the difference of f_j(x) and g_j(x + u + R beta_j),
 corrected for brightness. A rigid motion is linear in x, so it lies in the TRI3 space: the nodal displacement of light j
 is ``u + R beta_j`` and its derivative is the light's Hessian times R. The gradient of the reference image stands for
-that of the deformed one, carried along by the deformation gradient of the surface, so the Hessian is constant within a
-pass (docs: how it works).
+that of the deformed one, carried along by the deformation gradient of the surface, so the Hessian is constant as long
+as the weights are (docs: how it works).
 
-One pass after the other: equations -> iterate -> compare the states -> match -> weigh; then conclude. Every step is a
-function from frozen states to a frozen state. A `Weighting` holds what a pass begins with: the residual, which elements
-match, and how precise each light is.
+The loop is: assemble the equations, solve them by Gauss-Newton iterations, compare the states, weigh elements and
+lights; until the weights have converged; then conclude. Every step is a function from frozen states to a frozen state,
+and none depends on how many came before.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from rgbmidic.weights.precision import Precision
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weighting:
-    """Elements and lights of a pass, as the residual at an estimate determines them.
+    """Elements and lights that the equations are assembled from, as the residual at an estimate determines them.
 
     Attributes
     ----------
@@ -55,20 +55,17 @@ class Weighting:
         Elements that take part.
     precision
         Of the lights; None: not learnt.
-    reweight_until : int
-        The passes up to the one after this number begin with weights that are learnt anew.
-    weighting_displacement : ndarray, shape (N, 2)
-        Displacement at which the precision was learnt, px.
+    learnt_at : ndarray, shape (N, 2)
+        Displacement at which the precision was learnt, px; None: it was not.
     """
 
     residual: Residual
     matched: BoolArray
     precision: Precision | None = None
-    reweight_until: int = 0
-    weighting_displacement: FloatArray
+    learnt_at: FloatArray | None = None
 
     def weights(self, pixels: slice = slice(None)) -> FloatImage:
-        """Weights (k, P) of pixels in the next pass."""
+        """Weights (k, P) of pixels."""
         weights = self.prior_weights(pixels)
         return weights if self.precision is None else weights * self.precision.factor[:, pixels]
 
@@ -79,96 +76,53 @@ class Weighting:
             return weights
         return weights * np.repeat(self.matched, np.diff(self.residual.reference.pixels.offsets))[pixels]
 
+    def has_converged(self, equations: Equations) -> bool:
+        """Return True if the equations would be assembled from the same reference and weights again."""
+        if self.residual.reference is not equations.reference:
+            return False
+        # of 10,000 pixels a change of all weights by a thousandth is known to 1 % of it
+        sample = slice(None, None, equations.weights.shape[1] // 10_000 + 1)
+        weights = self.weights(sample)
+        total, change = float(weights.sum()), float(np.abs(weights - equations.weights[:, sample]).sum())
+        return total > 0 and change <= 1e-3 * total
+
 
 @stage("weights")
-def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
-    """Return the weighting of the first pass, at the initial guess, where the `residual` may be known."""
+def initial_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
+    """Return the weighting at the initial guess, where the `residual` may be known."""
     residual = residual or compare(problem, estimate)
-    return Weighting(
-        residual=residual,
-        matched=matching_elements(residual, estimate.displacement, min_zncc=problem.constants.min_initial_zncc),
-        weighting_displacement=estimate.displacement,
-    )
+    matched = matching_elements(residual, estimate.displacement, min_zncc=problem.constants.min_initial_zncc)
+    return Weighting(residual=residual, matched=matched)
 
 
 @stage("weights")
-def next_weighting(
-    problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
-) -> Weighting:
-    """Find residual, matching and precision anew at the displacement found by pass `number`."""
-    residual, method = compare(problem, estimate), problem.method
-    # the residual that the pass has minimised: by other grey levels the displacement is not yet the best
-    minimised = residual.with_values(last.residual.reference.values)
-    # without the precision of the lights, which the first pass has not, an element half on another body may match
-    precision = last.precision if number or method is None else method.precision(minimised)
-    matched = matching_elements(residual, estimate.displacement, precision)
-    if not matched.all() or estimate.longest > problem.constants.first_pass_tolerance:
-        lost = _lost_nodes(problem, last, equations, residual, estimate, number)
-        matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
-    if number >= problem.constants.max_reactivation_passes:
-        matched &= last.matched
-    reweight_until = _reweight_until(last, matched, equations, estimate, number)
-    weighting = replace(last, residual=residual, matched=matched, reweight_until=reweight_until)
-    if not is_reweighting(problem, weighting, number + 1):
-        return weighting
-    return replace(
-        weighting,
-        precision=precision if number == 0 or method is None else method.precision(minimised),
-        weighting_displacement=estimate.displacement,
-    )
+def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Estimate) -> Weighting:
+    """Compare the states at an estimate: which elements match, and how much each light counts.
 
-
-def _lost_nodes(
-    problem: Problem, last: Weighting, equations: Equations, residual: Residual, estimate: Estimate, number: int
-) -> BoolArray:
-    """Find the nodes (N,) that leave the next pass; a one-sided texture does not hold a node either, but matches."""
-    table = BlockTable.of_all(residual, equations.weights)
-    std = standard_uncertainty(residual, table, equations, last.precision)
-    unheld = std.max(axis=1) > problem.constants.max_std
-    wanders = np.zeros(len(unheld), dtype=bool)
-    if (
-        number >= problem.constants.max_reactivation_passes
-        and len(estimate.increments) < problem.options.max_iterations
-    ):
-        before, motion = estimate.increments[-2:]
-        wanders = motion > np.maximum(problem.constants.divergence_step, before / 2)
-    return np.asarray((unheld | wanders) & ~one_sided_texture(equations, residual))
-
-
-def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, estimate: Estimate, number: int) -> int:
-    """Return `Weighting.reweight_until` for the next pass.
-
-    Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
-    pass in which they do the residual is still that of a wrong match. It is learnt once more where the nodes have moved
-    since, and twice where another body at the region's rim has drawn the edge.
+    The precision of the lights, and what the reference is compared by, are learnt anew where the nodes have moved. As
+    long as they stay, elements may leave but not take part again: at a fragment's edge some would come and go.
     """
-    if (matched & ~last.matched).any():
-        return number + 1
-    constants = last.residual.reference.constants
-    if last.precision is not None and last.precision.rim_differs:
-        return max(last.reweight_until, constants.max_reactivation_passes)
-    motion = np.hypot(*(estimate.displacement - last.weighting_displacement).T)[equations.textured]
-    has_moved = (
-        number == 1 < len(last.residual.weights)
-        and (motion > constants.reweight_motion).mean() > constants.max_oscillating_fraction
-    )
-    return max(last.reweight_until, number) if has_moved else last.reweight_until
-
-
-def weights_converged(weighting: Weighting, equations: Equations) -> bool:
-    """Return True if the next pass would have the weights of the last one."""
-    constants = weighting.residual.reference.constants
-    sample = slice(None, None, equations.weights.shape[1] // constants.sample_count + 1)
-    weights = weighting.weights(sample)
-    total = float(weights.sum())
-    return (
-        total > 0 and float(np.abs(weights - equations.weights[:, sample]).sum()) <= constants.weight_tolerance * total
-    )
-
-
-def is_reweighting(problem: Problem, weighting: Weighting, number: int) -> bool:
-    """Return True if pass `number` begins with weights that are learnt anew."""
-    return problem.method is not None and number <= weighting.reweight_until + 1
+    constants, displacement = problem.constants, estimate.displacement
+    if last.learnt_at is not None:
+        motion = np.hypot(*(displacement - last.learnt_at).T)[equations.textured]
+        if np.sqrt((motion**2).mean()) <= constants.reweight_motion:
+            residual = compare(problem, estimate, last.residual.reference)
+            matched = last.matched & matching_elements(residual, displacement, last.precision)
+            return replace(last, residual=residual, matched=matched)
+    residual = compare(problem, estimate, problem.reference.filtered_as(displacement))
+    # of the residual that the displacement minimises: by other grey levels it is not yet the best
+    minimised = residual.with_values(last.residual.reference.values)
+    precision = None if problem.method is None else problem.method.precision(minimised)
+    matched = matching_elements(residual, displacement, precision)
+    weighting = Weighting(residual=residual, matched=matched, precision=precision, learnt_at=displacement)
+    adapted = with_consistent_gradient(residual, weighting.weights())
+    if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
+        return replace(weighting, residual=replace(residual, reference=adapted))
+    assert adapted.gain_window is not None  # without one nothing is smooth
+    narrow = adapted.with_gain_window(adapted.gain_window / constants.gain_window_ratio)
+    residual = compare(problem, estimate, narrow)
+    precision = None if problem.method is None else problem.method.precision(residual)
+    return replace(weighting, residual=residual, precision=precision)
 
 
 def solve(
@@ -235,63 +189,22 @@ def solve(
     rigid = np.zeros((len(reference.images), problem.functions.shape[1]))
     try:
         with one_blas_thread():
-            return _conclude(*_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
+            return _solve(problem, Estimate(displacement=initial, rigid=rigid), residual)
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
 
-def _passes(
-    problem: Problem, estimate: Estimate, residual: Residual | None
-) -> tuple[Problem, Estimate, Equations, Weighting]:
-    """Run passes until the weights have settled; the problem is returned with the lights' gradients decided."""
-    tolerance = problem.options.tolerance
+def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> Solution:
+    options = problem.options
     estimate, weighting = _refine_initial_guess(problem, estimate, residual)
-    equations: Equations | None = None
-    for number in range(problem.constants.max_passes):
-        if (
-            equations is not None
-            and not is_reweighting(problem, weighting, number)
-            and weights_converged(weighting, equations)
-        ):
+    for _ in range(8):  # two or three do, but where elements come and go
+        equations = assemble(problem, weighting, estimate)
+        estimate = iterate(problem, equations, weighting.residual, estimate)
+        weighting = weigh(problem, weighting, equations, estimate)
+        is_settled = estimate.longest <= options.tolerance and weighting.has_converged(equations)
+        if is_settled or len(estimate.increments) >= options.max_iterations:
             break
-        equations = _equations(problem, weighting, estimate)
-        pass_tolerance = max(tolerance, problem.constants.first_pass_tolerance) if number == 0 else tolerance
-        estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
-        reference = problem.reference
-        if number == 0:
-            problem = replace(problem, reference=reference.filtered_as(estimate.displacement))
-        weighting = next_weighting(problem, weighting, equations, estimate, number)
-        if number == 0:
-            problem, weighting = _adapt_reference(problem, weighting, estimate)
-            equations = equations if problem.reference is reference else None
-    assert equations is not None
-    if estimate.longest > tolerance:
-        estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
-        oscillating = equations.textured & (estimate.increments[-1] > tolerance)
-        matched = weighting.matched & ~oscillating[problem.reference.mesh.elements].any(axis=1)
-        is_minority = 0 < oscillating.mean() < problem.constants.max_oscillating_fraction and matched.any()
-        if is_minority and len(estimate.increments) < problem.options.max_iterations:
-            weighting = replace(weighting, residual=compare(problem, estimate), matched=matched)
-            equations = _equations(problem, weighting, estimate)
-            estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
-        weighting = replace(weighting, residual=compare(problem, estimate))
-    return problem, estimate, equations, weighting
-
-
-def _adapt_reference(problem: Problem, weighting: Weighting, estimate: Estimate) -> tuple[Problem, Weighting]:
-    """Adapt the reference's gradients, and the window of the gain, to what the first pass shows."""
-    constants, residual = problem.constants, weighting.residual
-    adapted = with_consistent_gradient(residual, weighting.weights())
-    if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
-        problem = replace(problem, reference=adapted)
-        return problem, replace(weighting, residual=replace(residual, reference=adapted))
-    assert adapted.gain_window is not None  # without one nothing is smooth
-    narrow = adapted.with_gain_window(adapted.gain_window / constants.gain_window_ratio)
-    problem = replace(problem, reference=narrow)
-    residual, precision = compare(problem, estimate), weighting.precision
-    if problem.method is not None:
-        precision = problem.method.precision(residual)
-    return problem, replace(weighting, residual=residual, precision=precision)
+    return conclude(problem, estimate, equations, weighting)
 
 
 @stage("search")
@@ -299,19 +212,19 @@ def _refine_initial_guess(
     problem: Problem, estimate: Estimate, residual: Residual | None
 ) -> tuple[Estimate, Weighting]:
     """Bring the initial guess nearer where elements do not match there; what does not match then is left out."""
-    weighting = first_weighting(problem, estimate, residual)
+    weighting = initial_weighting(problem, estimate, residual)
     if weighting.matched.all():
         return estimate, weighting
     refined = replace(estimate, displacement=refine_by_patch_matching(weighting.residual, estimate.displacement))
-    nearer = first_weighting(problem, refined)
+    nearer = initial_weighting(problem, refined)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
     return refined, replace(nearer, matched=matching_elements(nearer.residual, refined.displacement))
 
 
 @stage("equations")
-def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Equations:
-    """Build the equations of the next pass.
+def assemble(problem: Problem, weighting: Weighting, estimate: Estimate) -> Equations:
+    """Assemble the equations for a weighting.
 
     Raises
     ------
@@ -330,7 +243,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     prior_weights = None if weighting.precision is None else weighting.prior_weights()
     try:
         equations = Equations.build(
-            problem.reference, weighting.weights(), problem.functions, estimate.displacement, prior_weights
+            weighting.residual.reference, weighting.weights(), problem.functions, estimate.displacement, prior_weights
         )
     except np.linalg.LinAlgError as error:
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
@@ -348,9 +261,9 @@ def _nothing_left(weighting: Weighting) -> str:
 
 
 @stage("conclusion")
-def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
+def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
-    reference, mesh = problem.reference, problem.reference.mesh
+    reference, mesh = weighting.residual.reference, problem.reference.mesh
     active = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(reference.material, active, equations.information(reference))
     fitted = estimate.displacement
@@ -369,6 +282,10 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
+    # nodes that swing between two matches: where they are few their values are not known, else the frame's are not
+    is_moving = estimate.increments[-1] > problem.options.tolerance
+    if is_moving.mean() < problem.constants.max_oscillating_fraction:
+        std = np.where(is_moving[:, None], np.nan, std)
     positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
     inside = problem.deformed.contains(positions, std[:, :2])
     node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)

@@ -394,8 +394,6 @@ class Statistics(ValidPixels):
     rim_excess
         Variance at the rim of the region over that inside from which the rim shows another body, such as a background
         at rest, and has its own: of the some 16 values of a window chance makes 4 times in 1 of 1e7 (derived).
-    min_rim_fraction
-        Fraction of the rim that shows another body from which the weights are learnt anew: half of one side. Chosen.
     window
         In which variances are found.
 
@@ -415,7 +413,6 @@ class Statistics(ValidPixels):
     rounding: float = 1e-6
     independent_fraction: float = 0.1
     rim_excess: float = 4.0
-    min_rim_fraction: float = 0.1
     window: SlidingWindow = WINDOW
 
     def precision(self, residual: Residual) -> Precision:
@@ -459,15 +456,13 @@ class Statistics(ValidPixels):
         unit = max(np.float32(_typical(variance)), min_variance)
         variance, rim_variance = np.maximum((variance, rim_variance), min_variance)
         variance_map = pixels.from_blocks(variance, self.window.step)[0]
-        differs, differing_fraction = rim_variance > self.rim_excess * variance, 0.0
+        differs = rim_variance > self.rim_excess * variance
         if differs.any():
             rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
-            differing_fraction = float((rim_map > variance_map)[rim > 0].mean())
             np.copyto(variance_map, rim_map, where=rim > 0)
         displacing = residual.design_effect(mean, has_weight / variance_map)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
-        rim_differs = differing_fraction > self.min_rim_fraction
-        return Precision(factor=factor, loss_curvature=bend, rim_differs=rim_differs)
+        return Precision(factor=factor, loss_curvature=bend)
 
 
 def _typical(variance: FloatImage) -> float:

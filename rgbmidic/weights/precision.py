@@ -19,8 +19,6 @@ class Precision:
         Factor on the weights that are given, in any unit.
     loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
-    rim_differs
-        The rim of the region shows another body somewhere, which has drawn the residual's displacement.
 
     Examples
     --------
@@ -31,4 +29,3 @@ class Precision:
 
     factor: FloatImage
     loss_curvature: FloatImage
-    rim_differs: bool = False

@@ -10,7 +10,6 @@ from textures import Affine, Texture
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Status
 from rgbmidic.correlation.assembly import Assembly, RigidMotions, rigid_functions
-from rgbmidic.correlation.constants import USUAL
 from rgbmidic.mesh.tri3 import with_data
 
 SHAPE, REGION = (100, 200), (12, 12, 187, 87)
@@ -35,7 +34,7 @@ def test_the_bordered_equations_are_those_of_dense_algebra():
     solve = assembly.factorise(assembly.matrix(np.sum(per_light, axis=0), hold))
     textured = np.ones(len(mesh.elements), dtype=bool)
     rigid = RigidMotions.eliminate(
-        assembly, per_light, functions, with_data(assembly.smoothness, hold), solve, textured, USUAL
+        assembly, per_light, functions, with_data(assembly.smoothness, hold), solve, textured
     )
     assert not rigid.unobservable.any()
 
