@@ -89,19 +89,25 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
     They are second differences of the pixels around; nothing is added at the images' own edges.
     """
     height, width = images.shape[1:]
-    for light in range(len(images)):
-        for e in range(start, stop):
-            xx, xy, yy = factors[e, 0], factors[e, 1] / np.float32(4), factors[e, 2]
-            for q in range(run_offsets[e], run_offsets[e + 1]):
-                row, first = top + lines[q, 2], left + lines[q, 3]
-                if row == 0 or row == height - 1:
-                    continue
-                above, centre, below = images[light, row - 1], images[light, row], images[light, row + 1]
-                for c in range(max(first, 1), min(first + lines[q, 1], width - 1)):
-                    twice = centre[c] + centre[c]
-                    second = xx * (centre[c - 1] - twice + centre[c + 1]) + yy * (above[c] - twice + below[c])
-                    cross = above[c - 1] - above[c + 1] - below[c - 1] + below[c + 1]
-                    out[light, lines[q, 0] + c - first] += second + xy * cross
+    lights, one, quarter = np.uint64(len(images)), np.uint64(1), np.float32(0.25)
+    for e in range(start, stop):
+        xx, xy, yy = factors[e, 0], quarter * factors[e, 1], factors[e, 2]
+        for q in range(run_offsets[e], run_offsets[e + 1]):
+            row, column = top + lines[q, 2], left + lines[q, 3]
+            low, high = max(column, 1), min(column + lines[q, 1], width - 1)
+            if row == 0 or row == height - 1 or low >= high:
+                continue
+            b, c0, slot = np.uint64(row), np.uint64(low), np.uint64(lines[q, 0] + low - column)
+            a, d = b - one, b + one
+            for light in range(lights):
+                for i in range(np.uint64(high - low)):
+                    c = c0 + i
+                    twice = images[light, b, c] + images[light, b, c]
+                    second = xx * (images[light, b, c - one] - twice + images[light, b, c + one])
+                    second += yy * (images[light, a, c] - twice + images[light, d, c])
+                    cross = images[light, a, c - one] - images[light, a, c + one]
+                    cross += images[light, d, c + one] - images[light, d, c - one]
+                    out[light, slot + i] += second + xy * cross
 
 
 @compiled("out", axis=1, fastmath=FAST)

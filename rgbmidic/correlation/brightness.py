@@ -16,10 +16,9 @@ import numpy as np
 
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
-from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
 from rgbmidic.mesh.window import SlidingWindow, window_sums
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
@@ -57,16 +56,16 @@ class GainFit:
     weights: FloatImage
     sigma: float
     side: int
-    sums: FloatArray
-    totals: FloatArray
-    coefficients: FloatArray
+    sums: FloatImage
+    totals: FloatImage
+    coefficients: FloatImage
 
     @classmethod
     def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
         """Prepare the gains over `values` (k, P) with `weights` (k, P)."""
         side, count = block_side(sigma), len(values)
         sums = pixels.weighted_block_sums(values, weights, side, with_weights=True)
-        total, x, y, xx, xy, yy = _moments(sums[:count], sigma / side, 2)
+        total, x, y, xx, xy, yy = _moments(sums[:count].astype(np.float64), sigma / side, 2)
         # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With
         # a tenth a slope of the light is followed too little at edges: coarse speckle errs there by twice as much
         spread = 0.005 * (sigma / side) ** 2 * total
@@ -74,7 +73,7 @@ class GainFit:
         cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
         determinant = (cofactors * (total, x, y)).sum(axis=0)
         floor = 1e-6 * determinant.max(axis=(1, 2), keepdims=True, initial=0.0) + 1e-300
-        coefficients = np.where(determinant > floor, cofactors / np.maximum(determinant, floor), 0.0)
+        coefficients = np.where(determinant > floor, cofactors / np.maximum(determinant, floor), 0.0).astype(np.float32)
         return cls(
             pixels=pixels,
             weights=weights,
@@ -85,21 +84,21 @@ class GainFit:
             coefficients=coefficients,
         )
 
-    def block_sums(self, fields: FloatImage) -> FloatArray:
+    def block_sums(self, fields: FloatImage) -> FloatImage:
         """Sum fields (k, P) with the weights over the blocks, (k, h, w)."""
         return self.pixels.weighted_block_sums(fields, self.weights, self.side)
 
-    def gains(self, sums: FloatArray) -> FloatArray:
+    def gains(self, sums: FloatImage) -> FloatImage:
         """Return the gains (k, h, w) at the blocks of fields with such `sums`."""
         return np.asarray((self.coefficients * _moments(sums, self.sigma / self.side, 1)).sum(axis=0))
 
     def remainder(self, fields: FloatImage, values: FloatImage) -> FloatImage:
         """Return what fields (k, P) have beyond their gains times the `values` (k, P)."""
-        gains = self.pixels.from_blocks(self.gains(self.block_sums(fields)).astype(np.float32), self.side)
+        gains = self.pixels.from_blocks(self.gains(self.block_sums(fields)), self.side)
         return np.asarray(fields - np.multiply(gains, values, out=gains))
 
 
-def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
+def _moments(sums: AnyArray, sigma: float, order: int) -> AnyArray:
     """Moments of grids (k, h, w) about each block in a window of `sigma` blocks, (3 or 6, k, h, w).
 
     They are 1, x, y of `order` 1, and xx, xy, yy of 2, too.
@@ -108,7 +107,7 @@ def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
     window, arm = cv2.getGaussianKernel(2 * reach + 1, sigma), np.arange(-reach, reach + 1.0)[:, None]
     kernels = window, arm * window, arm * arm * window
     powers = [(x, total - x) for total in range(order + 1) for x in range(total, -1, -1)]
-    out = np.empty((len(powers), *sums.shape))
+    out = np.empty((len(powers), *sums.shape), dtype=sums.dtype)
     for moments, (x, y) in zip(out, powers, strict=True):
         for grid, moment in zip(sums, moments, strict=True):
             cv2.sepFilter2D(grid, -1, kernels[x], kernels[y], dst=moment, borderType=cv2.BORDER_CONSTANT)
@@ -146,7 +145,8 @@ class Brightness:
         side : int
             Of the blocks, px.
         """
-        gain = np.nan_to_num(self.gain, nan=1.0)[:, None, None]
+        one = np.float32(1)
+        gain = np.nan_to_num(self.gain, nan=1.0)[:, None, None].astype(np.float32)
         if self.fit is None:
             side, grids = max(shape), 1 / gain
         else:
@@ -154,9 +154,9 @@ class Brightness:
             rows, columns = np.ogrid[:height, :width]
             x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
             constant, along_x, along_y = self.offset.T[:, :, None, None]
-            plane = constant + along_x * x + along_y * y
+            plane = (constant + along_x * x + along_y * y).astype(np.float32)
             local = self.fit.gains(self.fit.sums - self.fit.block_sums(difference) - plane * self.fit.totals)
-            grids = np.where(np.isfinite(self.gain[:, None, None]), 1 / np.maximum(local, min_ratio * gain), 1.0)
+            grids = np.where(np.isfinite(self.gain[:, None, None]), 1 / np.maximum(local, min_ratio * gain), one)
         margin = (0, 0), (1, 1), (1, 1)
         if min(grids.shape[1:]) > 1:  # linear beyond the centres of the outermost blocks, too
             grids = np.pad(grids, margin, mode="reflect", reflect_type="odd")
@@ -164,7 +164,7 @@ class Brightness:
         else:
             grids = np.pad(grids, margin, mode="edge")
         out = np.empty((*grids.shape[:2], grids.shape[2] * side), dtype=np.float32)
-        for grid, image in zip(grids.astype(np.float32), out, strict=True):
+        for grid, image in zip(grids, out, strict=True):
             cv2.resize(grid, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR)
         return out, side
 
@@ -217,16 +217,19 @@ def _offset_planes(points: FloatArray, values: FloatArray, is_fitted: BoolArray)
     """
     middle = points.mean(axis=1, keepdims=True)
     size = np.maximum(np.ptp(points, axis=1).max(axis=1), 1.0)[:, None, None]
-    basis = np.concatenate([np.ones((*values.shape, 1)), (points - middle) / size], axis=2)
+    basis = np.concatenate([np.ones((*values.shape, 1)), (points - middle) / size], axis=2).transpose(0, 2, 1)
+    functions, held = np.concatenate([basis, values[:, None]], axis=1), np.diag([1e-6, *[1e-3 * values.shape[1]] * 2])
     level = np.median(values, axis=1)
-    plane, scatter = np.pad(level[:, None], ((0, 0), (0, 2))), _scatter(values - level[:, None])
-    for _ in range(3):  # until the scatter has settled
-        is_fitted = is_fitted & (scatter > 0)
-        scale = np.where(is_fitted, scatter, 1.0)
-        fitted = robust_fit(basis, values[..., None], 1e-3 * values.shape[1], scale)[..., 0]
+    plane, scatter, weight = np.pad(level[:, None], ((0, 0), (0, 2))), _scatter(values - level[:, None]), np.float64(1)
+    for _ in range(10 if is_fitted.any() else 0):  # until weights and scatter have settled
+        # no BLAS, whose sums may depend on the number of threads
+        sums = np.einsum("kam,kbm->kab", basis * weight, functions)
+        fitted = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0]
         plane = np.where(is_fitted[:, None], fitted, plane)
-        scatter = _scatter(values - (basis @ plane[..., None])[..., 0])
-    square = ((basis @ plane[..., None]) ** 2).mean(axis=(1, 2))
+        deviation = values - np.einsum("ka,kam->km", plane, basis)
+        scatter = _scatter(deviation)
+        weight = 1 / (1 + (deviation / np.where(scatter > 0, scatter, 1.0)[:, None]) ** 2)[:, None]
+    square = (np.einsum("ka,kam->km", plane, basis) ** 2).mean(axis=1)
     plane *= (square / np.maximum(square + scatter**2, 1e-300))[:, None]
     slopes = plane[:, 1:] / size[:, 0]
     return np.column_stack([plane[:, 0] - (slopes * middle[:, 0]).sum(axis=1), slopes])

@@ -164,7 +164,7 @@ class Residual:
         if window is None:
             return 0.0
         sums = pixels.weighted_block_sums(self.difference, self.weights, block_side(window), with_weights=True)
-        smooth, total = sums.reshape(2, -1)
+        smooth, total = sums.reshape(2, -1).astype(np.float64)
         return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(
             float(self.squares(self.weights)[..., 0].sum()), 1e-300
         )

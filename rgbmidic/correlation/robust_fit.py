@@ -7,7 +7,7 @@ import numpy as np
 from rgbmidic.typing import FloatArray
 
 
-def robust_fit(basis: FloatArray, values: FloatArray, ridge: float, scale: float | FloatArray) -> FloatArray:
+def robust_fit(basis: FloatArray, values: FloatArray, ridge: float, scale: float) -> FloatArray:
     """Fit values by functions of which the first is 1, by least squares with Cauchy weights.
 
     Parameters
@@ -18,7 +18,7 @@ def robust_fit(basis: FloatArray, values: FloatArray, ridge: float, scale: float
         Their c components.
     ridge
         Holds the slopes back where the points do not determine them.
-    scale : float or ndarray, shape (T,)
+    scale
         Of the weights, in the unit of the values.
 
     Returns

@@ -202,7 +202,7 @@ class PixelMap:
 
     def weighted_block_sums(
         self, values: FloatImage, weights: FloatImage, side: int, *, with_weights: bool = False
-    ) -> FloatArray:
+    ) -> FloatImage:
         """Sum `values` (k, P) times their `weights` (k, P) over such blocks, and then the weights where asked for.
 
         Parameters
@@ -218,11 +218,11 @@ class PixelMap:
 
         Returns
         -------
-        ndarray, shape (k or 2 k, rows, columns), float64
+        ndarray, shape (k or 2 k, rows, columns), float32
         """
         out = np.empty((len(values) * (1 + with_weights), *self.grid(side)), dtype=np.float32)
         weighted_block_sums(values, weights, self.lines, self.run_offsets, side, out)
-        return out.astype(np.float64)
+        return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P).
