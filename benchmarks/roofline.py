@@ -56,8 +56,9 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     values, weights, moments = reference.values, reference.pixel_weights, np.empty((1, elements, 6))
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
     there = warp_arguments(mesh, reference.pixels, motion)
-    states = deformed.coefficients, deformed.weights, deformed.nonuniform_weight_blocks, values, weights
-    outputs = reference.pixels.offsets, difference, weight, moments, np.empty((1, elements), dtype=bool)
+    is_changed = np.zeros((1, elements), dtype=bool)
+    states = deformed.coefficients, deformed.weights, values, weights, is_changed
+    outputs = reference.pixels.offsets, difference, weight, moments
     channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)

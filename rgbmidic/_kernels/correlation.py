@@ -266,66 +266,73 @@ def element_block_products(
 
 
 @compiled("elements", fastmath=FAST)
-def compare_states(
-    start, stop, coefficients, deformed_weight, partial, reference, reference_weight, runs, run_offsets, origin,
-    elements, barycentric, displacement, offsets, difference, weight, moments, is_changed,
+def find_changed_weights(
+    start, stop, partial, height, width, runs, run_offsets, origin, elements, barycentric, displacement, is_changed,
 ):  # fmt: skip
-    """Compare lights that move alike: differences, weights, and the sums of the grey levels of both states with them.
+    """Find where the weights of lights that move alike may be others than those of the reference.
 
-    `difference` (k, P) float32 receives ``f - g(x + u)`` at the owned pixels, 0 outside the deformed image, with the
-    `coefficients` (k, H + 2 PAD, W + 2 PAD) of g. `weight` (k, P) float32 receives the `reference_weight` (k, P) times
-    the `deformed_weight` (k, H, W) at the displaced position (bilinear), 0 outside and beside excluded pixels.
-    `partial` (k, h + 1, w + 1) int32 counts where that is other than 1: how many such blocks of `BLOCK` px lie above
-    and to the left. `moments` (k, E, 6) receives the sums of w, w f, w g, w f f, w f g, w g g. `is_changed` (k, E) says
-    where the weight may be another than that of the reference.
+    `partial` (k, h + 1, w + 1) int32 counts where a weight of the deformed images, of `height` and `width`, is other
+    than 1: how many such blocks of `BLOCK` px lie above and to the left. `is_changed` (k, E) receives the result.
 
     `runs` (R, 4) int32, `run_offsets` (E + 1,) and `origin` (E, 2) are as in `rgbmidic.mesh.PixelMap`; `barycentric`
     (E, 3, 3) float64 has the shape function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2).
     """
-    _, height, width = deformed_weight.shape
-    flat, lights, size = coefficients.ravel(), len(reference), largest_element(offsets) + LANES
-    buffer = np.empty((lights, size), np.float32)
     for e in range(start, stop):
-        if run_offsets[e] == run_offsets[e + 1]:
-            moments[:, e], is_changed[:, e] = 0.0, False
-            continue
-        motion = elements, barycentric, displacement
-        images = flat, height, width, reference
-        _element_differences(*images, runs, run_offsets, origin, *motion, e, np.uint64(offsets[e]), buffer)
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
-        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
-        left_x = top_y = np.float32(np.inf)
-        right_x = bottom_y = -np.float32(np.inf)
-        begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        left = top = np.float32(np.inf)
+        right = bottom = -np.float32(np.inf)
         for run in range(run_offsets[e], run_offsets[e + 1]):
             first, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
             for x in (first, first + np.float32(runs[run, 1])):  # its first pixel, and the one behind its last
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
-                left_x, right_x = min(left_x, px), max(right_x, px)
-                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
-        inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
-        sides = base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y
-        for light in range(lights):
-            is_changed[light, e] = not inside or _any_partial(partial, light, *sides)
-            if not is_changed[light, e]:
-                for i in range(np.uint64(begin), np.uint64(end)):
-                    weight[light, i] = reference_weight[light, i]
+                left, right, top, bottom = min(left, px), max(right, px), min(top, py), max(bottom, py)
+        sides = base_x + left, base_y + top, base_x + right, base_y + bottom
+        outside = sides[0] < 0 or sides[1] < 0 or sides[2] > width - 1 or sides[3] > height - 1
+        for light in range(len(is_changed)):
+            if run_offsets[e] == run_offsets[e + 1]:
+                is_changed[light, e] = False
             else:
-                for run in range(run_offsets[e], run_offsets[e + 1]):
-                    x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
-                    for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
-                        px = ux + fxx * x + fxy * y
-                        py = uy + fyx * x + fyy * y
-                        within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
-                        mean = _beside(deformed_weight, light, base_x, base_y, px, py) if within else _ZERO
-                        weight[light, i] = reference_weight[light, i] * mean
-                        x += _ONE
+                is_changed[light, e] = outside or _any_partial(partial, light, *sides)
+
+
+@compiled("elements", fastmath=FAST)
+def compare_states(
+    start, stop, coefficients, deformed_weight, reference, reference_weight, is_changed, runs, run_offsets, origin,
+    elements, barycentric, displacement, offsets, difference, weight, moments,
+):  # fmt: skip
+    """Compare lights that move alike: differences, weights, and the sums of the grey levels of both states with them.
+
+    `difference` (k, P) float32 receives ``f - g(x + u)`` at the owned pixels, 0 outside the deformed image, with the
+    `coefficients` (k, H + 2 PAD, W + 2 PAD) of g. `weight` (k, P) float32 holds the `reference_weight` (k, P); where it
+    `is_changed`, as by `find_changed_weights`, it receives that times the `deformed_weight` (k, H, W) at the displaced
+    position (bilinear), 0 outside and beside excluded pixels. `moments` (k, E, 6) receives the sums of w, w f, w g,
+    w f f, w f g, w g g. What describes the motion is as there.
+    """
+    _, height, width = deformed_weight.shape
+    flat, lights = coefficients.ravel(), len(reference)
+    buffer = np.empty((lights, largest_element(offsets) + LANES), np.float32)
+    for e in range(start, stop):
+        begin, motion = np.uint64(offsets[e]), (elements, barycentric, displacement)
+        number = np.uint64(offsets[e + 1]) - begin
+        _element_differences(flat, height, width, reference, runs, run_offsets, origin, *motion, e, begin, buffer)
+        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
+        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        for light in range(lights):
+            for run in range(run_offsets[e], run_offsets[e + 1] if is_changed[light, e] else run_offsets[e]):
+                x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+                for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
+                    px = ux + fxx * x + fxy * y
+                    py = uy + fyx * x + fyy * y
+                    within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
+                    mean = _beside(deformed_weight, light, base_x, base_y, px, py) if within else _ZERO
+                    weight[light, i] = reference_weight[light, i] * mean
+                    x += _ONE
             total = f1 = g1 = f2 = fg = g2 = 0.0
-            for i in range(np.uint64(begin), np.uint64(end)):
-                f, w, d = reference[light, i], weight[light, i], buffer[light, i - np.uint64(begin)]
-                difference[light, i] = d
+            for i in range(number):
+                f, w, d = reference[light, begin + i], weight[light, begin + i], buffer[light, i]
+                difference[light, begin + i] = d
                 g = f - d
                 wf, wg = w * f, w * g
                 total += w

@@ -626,11 +626,11 @@ def _sample_registered_lights(
         np.empty((2, *leading_shape, inside.size), dtype=np.float32) for leading_shape in (values.shape[:1], ())
     )
     zero, unused, moments = np.zeros_like(inside[None]), np.empty_like(inside), np.empty((1, len(mesh.elements), 6))
-    is_changed = np.empty(moments.shape[:2], dtype=bool)
+    is_changed = np.ones(moments.shape[:2], dtype=bool)
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         one, warp = slice(light, light + 1), warp_arguments(mesh, pixels, motion)
-        images = state.coefficients[one], state.weights[one], state.nonuniform_weight_blocks[one], zero, inside[None]
-        compare_states(*images, *warp, pixels.offsets, values[one], weights[one], moments, is_changed)
+        images = state.coefficients[one], state.weights[one], zero, inside[None], is_changed
+        compare_states(*images, *warp, pixels.offsets, values[one], weights[one], moments)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
         sample_with_gradient(state.coefficients[light], x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient

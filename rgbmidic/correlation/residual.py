@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import compare_states, element_squares
+from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
@@ -77,14 +77,18 @@ class Residual:
         -------
         Residual
         """
-        values, pixels = reference.values, reference.pixels
-        difference, weights = np.empty_like(values), np.empty_like(values)
-        moments = np.empty((len(values), len(reference.mesh.elements), 6))
+        values, pixels, shape = reference.values, reference.pixels, deformed.weights.shape[1:]
+        moments, difference = np.empty((len(values), len(reference.mesh.elements), 6)), np.empty_like(values)
         is_changed = np.empty(moments.shape[:2], dtype=bool)
-        for lights, warp in reference.warps(deformed, displacements):
-            images = deformed.coefficients[lights], deformed.weights[lights], deformed.nonuniform_weight_blocks[lights]
-            found = difference[lights], weights[lights], moments[lights], is_changed[lights]
-            compare_states(*images, values[lights], reference.pixel_weights[lights], *warp, pixels.offsets, *found)
+        warps = list(reference.warps(deformed, displacements))
+        for lights, warp in warps:
+            find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
+        weights = reference.pixel_weights.copy() if is_changed.any() else reference.pixel_weights
+        for lights, warp in warps:
+            states = deformed.coefficients[lights], deformed.weights[lights], values[lights]
+            reference_weights = reference.pixel_weights[lights], is_changed[lights]
+            outputs = difference[lights], weights[lights], moments[lights]
+            compare_states(*states, *reference_weights, *warp, pixels.offsets, *outputs)
         brightness = reference.brightness_of(weights, moments, bool(is_changed.any()))
         correct_brightness(*reference.brightness_fields(brightness, difference), pixels.offsets, difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
