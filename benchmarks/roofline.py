@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import differences, warped_weights
+from rgbmidic._kernels.correlation import compare_states
 from rgbmidic._kernels.illumination import unmix
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.correlation import Deformed, Reference
@@ -52,29 +52,25 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     reference, deformed = Reference.prepare(image, region, mesh=mesh), Deformed.prepare(image)
     motion = (mesh.nodes - size / 2) @ np.array([[0.01, 0.035], [-0.035, 0.01]])
     owned, count, elements = reference.pixels.local_x.size, size * size, len(mesh.elements)
-    difference, weight = np.empty((2, owned), np.float32)
-    values, weights, moments = reference.values[0], reference.pixel_weights[0], np.empty((elements, 6))
+    difference, weight = np.empty((2, 1, owned), np.float32)
+    values, weights, moments = reference.values, reference.pixel_weights, np.empty((1, elements, 6))
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
     there = warp_arguments(mesh, reference.pixels, motion)
-    warped = (
-        deformed.weights[0],
-        deformed.nonuniform_weight_blocks[0],
-        values,
-        difference,
-        weights,
-        *there,
-        weight,
-        moments,
-        np.empty(elements, dtype=bool),
-    )
+    is_changed = np.zeros((1, elements), dtype=bool)
+    states = deformed.coefficients, deformed.weights, values, weights, is_changed
+    outputs = reference.pixels.offsets, difference, weight, moments
     channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
-        ("difference", owned, 12, lambda: differences(deformed.coefficients[0], values, *there, difference)),
-        ("weights and moments", owned, 16, lambda: warped_weights(*warped)),
-        ("right-hand side", owned, 24, lambda: reference.projected(weights, difference, reference.gradient[:, 0])),
-        ("Hessian", owned, 20, lambda: reference.blocks(weights, reference.gradient[:, 0])),
+        (
+            "difference of states",
+            owned,
+            20,
+            lambda: compare_states(*states, *there, reference.pixels.offsets, *outputs),
+        ),
+        ("right-hand side", owned, 24, lambda: reference.projected(weights, difference, reference.gradient)),
+        ("Hessian", owned, 20, lambda: reference.hessians(weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, grid, size, needed, lights, lit)),
     ]

@@ -99,49 +99,67 @@ def _element_motion(displacement, elements, barycentric, origin, e):
     )
 
 
-@compiled("elements", fastmath=FAST)
-def differences(
-    start, stop, coefficients, reference, runs, run_offsets, origin, elements, barycentric, displacement, out
-):
-    """Differences ``f - g(x + u)`` of one light at the owned pixels, 0 outside the deformed image.
+@helper(fastmath=FAST)
+def _element_differences(
+    coefficients, height, width, reference, runs, run_offsets, origin, elements, barycentric, displacement, e, begin,
+    out,
+):  # fmt: skip
+    """Write ``f - g(x + u)`` of element e into ``out`` (k, n), whose first is slot `begin`; 0 outside the image.
 
-    `coefficients` of the deformed image; `reference` and `out` (P,) float32; `runs` (R, 4) int32, `run_offsets`
-    (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric` (E, 3, 3) float64 with the shape function
-    ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2) float64.
+    `coefficients` are those of all lights, one behind the other, whose images have `height` and `width`. What follows
+    the element's last pixel is overwritten, up to a vector.
     """
-    height, width = coefficients.shape[0] - 2 * PAD, coefficients.shape[1] - 2 * PAD
-    flat, across = coefficients.ravel(), np.uint64(coefficients.shape[1])
-    for e in range(start, stop):
-        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
-        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
-        (end_x, pace_x), (end_y, pace_y) = _crossing(fxx - _ONE), _crossing(fyx)
-        for run in range(run_offsets[e], run_offsets[e + 1]):
-            slot, remaining = np.int64(runs[run, 0]), np.int64(runs[run, 1])
-            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
-            while remaining > 0:
-                px = ux + fxx * x + fxy * y
-                py = uy + fyx * x + fyy * y
-                if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
-                    out[slot] = _ZERO
-                    slot, remaining, x = slot + 1, remaining - 1, x + _ONE
-                    continue
-                cx, cy = np.floor(px), np.floor(py)
-                column, row = base_x + np.int64(cx), base_y + np.int64(cy)
-                tx, ty = px - cx, py - cy
-                side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(remaining - 1))
-                n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
-                # whole vectors, of which the last one may be too long, where memory goes on so far
-                filled = (n + LANES - 1) // LANES * LANES
-                if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
-                    filled = n
-                i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
+    across = np.uint64(width + 2 * PAD)
+    area, lights = np.uint64(height + 2 * PAD) * across, np.uint64(len(reference))
+    base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+    low_x, low_y = np.float32(-base_x), np.float32(-base_y)
+    high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+    (end_x, pace_x), (end_y, pace_y) = _crossing(fxx - _ONE), _crossing(fyx)
+    for run in range(run_offsets[e], run_offsets[e + 1]):
+        slot, remaining = np.int64(runs[run, 0]), np.int64(runs[run, 1])
+        x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+        while remaining > 0:
+            px = ux + fxx * x + fxy * y
+            py = uy + fyx * x + fyy * y
+            target = np.uint64(slot) - begin
+            if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
+                for light in range(lights):
+                    out[light, target] = _ZERO
+                slot, remaining, x = slot + 1, remaining - 1, x + _ONE
+                continue
+            cx, cy = np.floor(px), np.floor(py)
+            column, row = base_x + np.int64(cx), base_y + np.int64(cy)
+            tx, ty = px - cx, py - cy
+            side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(remaining - 1))
+            n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
+            # whole vectors, of which the last one may be too long, where memory goes on so far
+            filled = (n + LANES - 1) // LANES * LANES
+            if slot + filled > reference.shape[1] or column + filled + 3 >= width + 2 * PAD:
+                filled = n
+            i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
+            for light in range(lights):
+                cell = first + light * area
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
-                    g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
-                    if np.int32(i) < np.int32(n):
-                        out[i0 + i] = reference[i0 + i] - g
-                slot, remaining, x = slot + n, remaining - n, x + np.float32(n)
+                    g = _spline(coefficients, cell, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
+                    out[light, target + i] = reference[light, i0 + i] - g
+            slot, remaining, x = slot + n, remaining - n, x + np.float32(n)
+
+
+@compiled("elements", fastmath=FAST)
+def differences(
+    start, stop, coefficients, height, width, reference, runs, run_offsets, origin, elements, barycentric, displacement,
+    offsets, out,
+):  # fmt: skip
+    """Differences ``f - g(x + u)`` (k, P) of lights that move alike, as in `compare_states`."""
+    flat, lights = coefficients.ravel(), len(reference)
+    buffer = np.empty((lights, largest_element(offsets) + LANES), dtype=np.float32)
+    for e in range(start, stop):
+        begin, motion = np.uint64(offsets[e]), (runs, run_offsets, origin, elements, barycentric, displacement)
+        _element_differences(flat, height, width, reference, *motion, e, begin, buffer)
+        for light in range(lights):
+            for i in range(np.uint64(offsets[e + 1]) - begin):
+                out[light, begin + i] = buffer[light, i]
 
 
 @helper()
@@ -248,85 +266,103 @@ def element_block_products(
 
 
 @compiled("elements", fastmath=FAST)
-def warped_weights(
-    start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
-    elements, barycentric, displacement, weight, moments, is_changed,
+def find_changed_weights(
+    start, stop, partial, height, width, runs, run_offsets, origin, elements, barycentric, displacement, is_changed,
 ):  # fmt: skip
-    """Warp the weights of one light to the owned pixels, and sum the grey levels of both states with them.
+    """Find where the weights of lights that move alike may be others than those of the reference.
 
-    `weight` (P,) float32 receives the `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced
-    position (bilinear), 0 outside and beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other
-    than 1: how many such blocks of `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f,
-    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,). `is_changed` (E,) says
-    where the weight may be another than that of the reference.
+    `partial` (k, h + 1, w + 1) int32 counts where a weight of the deformed images, of `height` and `width`, is other
+    than 1: how many such blocks of `BLOCK` px lie above and to the left. `is_changed` (k, E) receives the result.
+
+    `runs` (R, 4) int32, `run_offsets` (E + 1,) and `origin` (E, 2) are as in `rgbmidic.mesh.PixelMap`; `barycentric`
+    (E, 3, 3) float64 has the shape function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2).
     """
-    height, width = deformed_weight.shape
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
-        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
-        left_x = top_y = np.float32(np.inf)
-        right_x = bottom_y = -np.float32(np.inf)
-        if run_offsets[e] == run_offsets[e + 1]:
-            moments[e], is_changed[e] = 0.0, False
-            continue
-        begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        left = top = np.float32(np.inf)
+        right = bottom = -np.float32(np.inf)
         for run in range(run_offsets[e], run_offsets[e + 1]):
             first, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
             for x in (first, first + np.float32(runs[run, 1])):  # its first pixel, and the one behind its last
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
-                left_x, right_x = min(left_x, px), max(right_x, px)
-                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
-        inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
-        sides = base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y
-        is_changed[e] = not inside or _any_partial(partial, *sides)
-        if not is_changed[e]:
-            for i in range(np.uint64(begin), np.uint64(end)):
-                weight[i] = reference_weight[i]
-        else:
-            for run in range(run_offsets[e], run_offsets[e + 1]):
+                left, right, top, bottom = min(left, px), max(right, px), min(top, py), max(bottom, py)
+        sides = base_x + left, base_y + top, base_x + right, base_y + bottom
+        outside = sides[0] < 0 or sides[1] < 0 or sides[2] > width - 1 or sides[3] > height - 1
+        for light in range(len(is_changed)):
+            if run_offsets[e] == run_offsets[e + 1]:
+                is_changed[light, e] = False
+            else:
+                is_changed[light, e] = outside or _any_partial(partial, light, *sides)
+
+
+@compiled("elements", fastmath=FAST)
+def compare_states(
+    start, stop, coefficients, deformed_weight, reference, reference_weight, is_changed, runs, run_offsets, origin,
+    elements, barycentric, displacement, offsets, difference, weight, moments,
+):  # fmt: skip
+    """Compare lights that move alike: differences, weights, and the sums of the grey levels of both states with them.
+
+    `difference` (k, P) float32 receives ``f - g(x + u)`` at the owned pixels, 0 outside the deformed image, with the
+    `coefficients` (k, H + 2 PAD, W + 2 PAD) of g. `weight` (k, P) float32 holds the `reference_weight` (k, P); where it
+    `is_changed`, as by `find_changed_weights`, it receives that times the `deformed_weight` (k, H, W) at the displaced
+    position (bilinear), 0 outside and beside excluded pixels. `moments` (k, E, 6) receives the sums of w, w f, w g,
+    w f f, w f g, w g g. What describes the motion is as there.
+    """
+    _, height, width = deformed_weight.shape
+    flat, lights = coefficients.ravel(), len(reference)
+    buffer = np.empty((lights, largest_element(offsets) + LANES), np.float32)
+    for e in range(start, stop):
+        begin, motion = np.uint64(offsets[e]), (elements, barycentric, displacement)
+        number = np.uint64(offsets[e + 1]) - begin
+        _element_differences(flat, height, width, reference, runs, run_offsets, origin, *motion, e, begin, buffer)
+        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
+        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        for light in range(lights):
+            for run in range(run_offsets[e], run_offsets[e + 1] if is_changed[light, e] else run_offsets[e]):
                 x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
                 for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
                     px = ux + fxx * x + fxy * y
                     py = uy + fyx * x + fyy * y
                     within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
-                    mean = _beside(deformed_weight, base_x, base_y, px, py) if within else _ZERO
-                    weight[i] = reference_weight[i] * mean
+                    mean = _beside(deformed_weight, light, base_x, base_y, px, py) if within else _ZERO
+                    weight[light, i] = reference_weight[light, i] * mean
                     x += _ONE
-        total = f1 = g1 = f2 = fg = g2 = 0.0
-        for i in range(np.uint64(begin), np.uint64(end)):
-            f, w = reference[i], weight[i]
-            g = f - difference[i]
-            wf, wg = w * f, w * g
-            total += w
-            f1 += wf
-            g1 += wg
-            f2 += wf * f
-            fg += wf * g
-            g2 += wg * g
-        moments[e, 0], moments[e, 1], moments[e, 2] = total, f1, g1
-        moments[e, 3], moments[e, 4], moments[e, 5] = f2, fg, g2
+            total = f1 = g1 = f2 = fg = g2 = 0.0
+            for i in range(number):
+                f, w, d = reference[light, begin + i], weight[light, begin + i], buffer[light, i]
+                difference[light, begin + i] = d
+                g = f - d
+                wf, wg = w * f, w * g
+                total += w
+                f1 += wf
+                g1 += wg
+                f2 += wf * f
+                fg += wf * g
+                g2 += wg * g
+            moments[light, e, 0], moments[light, e, 1], moments[light, e, 2] = total, f1, g1
+            moments[light, e, 3], moments[light, e, 4], moments[light, e, 5] = f2, fg, g2
 
 
 @helper()
-def _any_partial(partial, left, top, right, bottom):
+def _any_partial(partial, light, left, top, right, bottom):
     """Tell whether a block is partial that holds a pixel of this rectangle, or the next one on the right or below."""
     a, b = np.int64(left) // BLOCK, np.int64(top) // BLOCK
-    c = min((np.int64(right) + 1) // BLOCK + 1, partial.shape[1] - 1)
-    d = min((np.int64(bottom) + 1) // BLOCK + 1, partial.shape[0] - 1)
-    return partial[d, c] - partial[b, c] - partial[d, a] + partial[b, a] > 0
+    c = min((np.int64(right) + 1) // BLOCK + 1, partial.shape[2] - 1)
+    d = min((np.int64(bottom) + 1) // BLOCK + 1, partial.shape[1] - 1)
+    return partial[light, d, c] - partial[light, b, c] - partial[light, d, a] + partial[light, b, a] > 0
 
 
 @helper()
-def _beside(weight, base_x, base_y, px, py):
-    """Bilinear mean of a weight (H, W) at a position inside; 0 next to an excluded pixel, which would lend to it."""
+def _beside(weight, light, base_x, base_y, px, py):
+    """Bilinear mean of a light's weight (k, H, W) at a position; 0 next to an excluded one, which would lend to it."""
     cx, cy = np.floor(px), np.floor(py)
     column, row = base_x + np.int64(cx), base_y + np.int64(cy)
     tx, ty = px - cx, py - cy
-    right, below = min(column + 1, weight.shape[1] - 1), min(row + 1, weight.shape[0] - 1)
-    a, b = weight[row, column], weight[row, right]
-    c, d = weight[below, column], weight[below, right]
+    right, below = min(column + 1, weight.shape[2] - 1), min(row + 1, weight.shape[1] - 1)
+    a, b = weight[light, row, column], weight[light, row, right]
+    c, d = weight[light, below, column], weight[light, below, right]
     if min(a, b, c, d) <= _ZERO:
         return _ZERO
     return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
@@ -362,49 +398,52 @@ def element_sums(start, stop, values, factor, offsets, out):
             out[n, e, 0], out[n, e, 1] = total, product
 
 
-@compiled("out", fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def element_vector(start, stop, weight, values, first, second, local_x, local_y, offsets, barycentric, out):
-    """Project two fields on the shape functions.
+    """Project two fields of each light on the shape functions.
 
-    ``out`` (E, 3, 2) receives the sums of ``weight values first phi`` and ``weight values second phi``; all fields are
-    (P,) float32.
+    ``out`` (k, E, 3, 2) receives the sums of ``weight values first phi`` and ``weight values second phi``; all fields
+    are (k, P) float32.
     """
-    for e in range(start, stop):
-        _project(weight, values[offsets[e] :], first, second, local_x, local_y, offsets, barycentric, e, out)
+    for e in range(start, min(stop, offsets.size - 1)):
+        for light in range(len(weight)):
+            fields = weight, values, np.uint64(0), first, second, local_x, local_y
+            _project(light, *fields, offsets, barycentric, e, out)
 
 
-@compiled("out", fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def corrected_vector(
     start, stop, weight, difference, first, second, reference, inverse_level, scales, side, offset, lines, run_offsets,
     local_x, local_y, offsets, barycentric, out,
 ):  # fmt: skip
     """Do the same with a `difference` that is corrected as by `correct_brightness`, and stays as it is."""
-    values = np.empty(largest_element(offsets) + LANES, dtype=np.float32)
+    corrected = np.empty((len(weight), largest_element(offsets) + LANES), dtype=np.float32)
     brightness = reference, inverse_level, scales, side, offset
-    for e in range(start, stop):
-        correct_element(difference, *brightness, lines, run_offsets, offsets, e, values)
-        _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out)
+    for e in range(start, min(stop, offsets.size - 1)):
+        begin = np.uint64(offsets[e])
+        for light in range(len(weight)):
+            correct_element(light, difference, *brightness, lines, run_offsets, e, begin, corrected)
+            fields = weight, corrected, begin, first, second, local_x, local_y
+            _project(light, *fields, offsets, barycentric, e, out)
 
 
 @helper(fastmath=FAST)
-def _project(weight, values, first, second, local_x, local_y, offsets, barycentric, e, out):
-    """Project on the shape functions of element e, whose `values` these are."""
-    b00, b01, b02 = _shape_function(barycentric, e, 0)
-    b10, b11, b12 = _shape_function(barycentric, e, 1)
-    p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
-    begin = np.uint64(offsets[e])
-    for n in range(np.uint64(offsets[e + 1]) - begin):
-        i = begin + n
-        l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
-        l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
-        weighted = weight[i] * values[n]
-        p, q = weighted * first[i], weighted * second[i]
-        p0 += p * l0
-        p1 += p * l1
-        p2 += p
-        q0 += q * l0
-        q1 += q * l1
-        q2 += q
-    out[e, 0, 0], out[e, 0, 1] = p0, q0
-    out[e, 1, 0], out[e, 1, 1] = p1, q1
-    out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1
+def _project(light, weight, values, begin, first, second, local_x, local_y, offsets, barycentric, e, out):
+    """Project on the shape functions of element e; slot `begin` is the first of the `values` (k, n)."""
+    p = px = py = q = qx = qy = _ZERO
+    low, high = np.uint64(offsets[e]), np.uint64(offsets[e + 1])
+    at = low - begin
+    for n in range(high - low):
+        i = low + n
+        weighted = weight[light, i] * values[light, at + n]
+        a, b = weighted * first[light, i], weighted * second[light, i]
+        p += a
+        px += a * local_x[i]
+        py += a * local_y[i]
+        q += b
+        qx += b * local_x[i]
+        qy += b * local_y[i]
+    for a in range(3):
+        constant, along_x, along_y = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
+        out[light, e, a, 0] = constant * p + along_x * px + along_y * py
+        out[light, e, a, 1] = constant * q + along_x * qx + along_y * qy

@@ -89,19 +89,25 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
     They are second differences of the pixels around; nothing is added at the images' own edges.
     """
     height, width = images.shape[1:]
-    for light in range(len(images)):
-        for e in range(start, stop):
-            xx, xy, yy = factors[e, 0], factors[e, 1] / np.float32(4), factors[e, 2]
-            for q in range(run_offsets[e], run_offsets[e + 1]):
-                row, first = top + lines[q, 2], left + lines[q, 3]
-                if row == 0 or row == height - 1:
-                    continue
-                above, centre, below = images[light, row - 1], images[light, row], images[light, row + 1]
-                for c in range(max(first, 1), min(first + lines[q, 1], width - 1)):
-                    twice = centre[c] + centre[c]
-                    second = xx * (centre[c - 1] - twice + centre[c + 1]) + yy * (above[c] - twice + below[c])
-                    cross = above[c - 1] - above[c + 1] - below[c - 1] + below[c + 1]
-                    out[light, lines[q, 0] + c - first] += second + xy * cross
+    lights, one, quarter = np.uint64(len(images)), np.uint64(1), np.float32(0.25)
+    for e in range(start, stop):
+        xx, xy, yy = factors[e, 0], quarter * factors[e, 1], factors[e, 2]
+        for q in range(run_offsets[e], run_offsets[e + 1]):
+            row, column = top + lines[q, 2], left + lines[q, 3]
+            low, high = max(column, 1), min(column + lines[q, 1], width - 1)
+            if row == 0 or row == height - 1 or low >= high:
+                continue
+            b, c0, slot = np.uint64(row), np.uint64(low), np.uint64(lines[q, 0] + low - column)
+            a, d = b - one, b + one
+            for light in range(lights):
+                for i in range(np.uint64(high - low)):
+                    c = c0 + i
+                    twice = images[light, b, c] + images[light, b, c]
+                    second = xx * (images[light, b, c - one] - twice + images[light, b, c + one])
+                    second += yy * (images[light, a, c] - twice + images[light, d, c])
+                    cross = images[light, a, c - one] - images[light, a, c + one]
+                    cross += images[light, d, c + one] - images[light, d, c - one]
+                    out[light, slot + i] += second + xy * cross
 
 
 @compiled("out", axis=1, fastmath=FAST)
@@ -114,13 +120,13 @@ def block_sums(start, stop, values, lines, run_offsets, side, out):
 
 
 @compiled("out", axis=1, fastmath=FAST)
-def weighted_block_sums(start, stop, values, weight, lines, run_offsets, side, out):
-    """Sum a field (P,) times a `weight` (P,), and the weight, over blocks of `side` px: ``out`` (2, h, w).
+def weighted_block_sums(start, stop, values, weights, lines, run_offsets, side, out):
+    """Sum fields (k, P) times their `weights` (k, P), and then these, over blocks of `side` px: ``out`` (2 k, h, w).
 
-    One of (1, h, w) receives the first sum only.
+    One of (k, h, w) receives the first sums only.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
+    lights, columns = len(values), np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         block, low, high = np.int64(-1), np.int64(0), np.int64(0)
         for q in range(run_offsets[e], run_offsets[e + 1]):
@@ -131,13 +137,14 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, side, o
                 _flush(columns, low, high, side, block, out)
                 block, low, high = row // side, column, column
             low, high = min(low, column), max(high, column + number)
-            at, to, filled = np.uint64(slot), np.uint64(column), np.uint32(_filled(number, values.size - slot))
-            for i in range(filled):
-                product = weight[at + i] * values[at + i]
-                columns[0, to + i] += product if np.int32(i) < np.int32(number) else _ZERO
-            if len(out) > 1:
+            at, to, filled = np.uint64(slot), np.uint64(column), np.uint32(_filled(number, values.shape[1] - slot))
+            for n in range(lights):
                 for i in range(filled):
-                    columns[1, to + i] += weight[at + i] if np.int32(i) < np.int32(number) else _ZERO
+                    product = weights[n, at + i] * values[n, at + i]
+                    columns[n, to + i] += product if np.int32(i) < np.int32(number) else _ZERO
+            for n in range(lights, len(out)):
+                for i in range(filled):
+                    columns[n, to + i] += weights[n - lights, at + i] if np.int32(i) < np.int32(number) else _ZERO
         _flush(columns, low, high, side, block, out)
 
 
@@ -145,41 +152,43 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, side, o
 def correct_brightness(
     start, stop, reference, inverse_level, scales, side, offset, lines, run_offsets, offsets, difference,
 ):  # fmt: skip
-    """Correct the `difference` f - g of one light: it becomes ``(f - scale (g - b)) inverse_level``.
+    """Correct the `difference` f - g of each light (k, P): it becomes ``(f - scale (g - b)) inverse_level``.
 
-    The rows of `scales` (h, W) belong to the centres of rows of blocks of `side` px, the first one of which lies above
-    the rectangle around the pixels, as the first `side` columns lie before it. The `offset` b has a constant and slopes
-    along columns and rows; the other fields are (P,) float32.
+    The rows of a light's `scales` (k, h, W) belong to the centres of rows of blocks of `side` px, the first one of
+    which lies above the rectangle around the pixels, as the first `side` columns lie before it. Its `offset` b (k, 3)
+    has a constant and slopes along columns and rows; the other fields are (k, P) float32.
     """
-    corrected = np.empty(largest_element(offsets) + LANES, dtype=np.float32)
+    corrected = np.empty((len(difference), largest_element(offsets) + LANES), dtype=np.float32)
     brightness = reference, inverse_level, scales, side, offset
     for e in range(start, min(stop, offsets.size - 1)):
-        correct_element(difference, *brightness, lines, run_offsets, offsets, e, corrected)
         first = np.uint64(offsets[e])
-        for i in range(np.uint64(offsets[e + 1]) - first):
-            difference[first + i] = corrected[i]
+        for light in range(len(difference)):
+            correct_element(light, difference, *brightness, lines, run_offsets, e, first, corrected)
+            for i in range(np.uint64(offsets[e + 1]) - first):
+                difference[light, first + i] = corrected[light, i]
 
 
 @helper(fastmath=FAST)
 def correct_element(
-    difference, reference, inverse_level, scales, side, offset, lines, run_offsets, offsets, e, out,
+    light, difference, reference, inverse_level, scales, side, offset, lines, run_offsets, e, begin, out,
 ):  # fmt: skip
-    """Write the corrected difference of an element into ``out``, which is longer by a vector."""
-    constant, slope, down = np.float32(offset[0]), np.float32(offset[1]), np.float32(offset[2])
+    """Write the corrected difference of an element, from slot `begin`, into ``out`` (k, n), longer by a vector."""
+    constant, slope, down = np.float32(offset[light, 0]), np.float32(offset[light, 1]), np.float32(offset[light, 2])
     pace = _ONE / np.float32(side)
     for q in range(run_offsets[e], run_offsets[e + 1]):
         slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], lines[q, 3] + side
-        first, target, from_column = np.uint64(slot), np.uint64(slot - offsets[e]), np.uint64(column)
+        at, from_column = np.uint64(slot), np.uint64(column)
+        target = at - begin
         position = (np.float32(row) + _HALF) * pace + _HALF
         above = np.uint32(position)
         fraction, below = position - np.float32(above), above + np.uint32(1)
         b = constant + down * np.float32(row) + slope * np.float32(column - side)
-        filled = _filled(number, min(reference.size - slot, scales.shape[1] - column))
+        filled = _filled(number, min(reference.shape[1] - slot, scales.shape[2] - column))
         for i in range(np.uint32(filled)):  # the next row overwrites what is too long
-            f, scale = reference[first + i], scales[above, from_column + i]
-            scale += fraction * (scales[below, from_column + i] - scale)
-            g = f - difference[first + i] - (b + slope * np.float32(np.int32(i)))
-            out[target + i] = (f - scale * g) * inverse_level[first + i]
+            f, scale = reference[light, at + i], scales[light, above, from_column + i]
+            scale += fraction * (scales[light, below, from_column + i] - scale)
+            g = f - difference[light, at + i] - (b + slope * np.float32(np.int32(i)))
+            out[light, target + i] = (f - scale * g) * inverse_level[light, at + i]
 
 
 @compiled("out", axis=1, fastmath=FAST)

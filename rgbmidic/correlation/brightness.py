@@ -16,10 +16,9 @@ import numpy as np
 
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
-from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
 from rgbmidic.mesh.window import SlidingWindow, window_sums
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
@@ -32,7 +31,7 @@ def block_side(sigma: float) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GainFit:
-    """Gain of one field over another, by local linear regression in a Gaussian window (Fan and Gijbels 1996).
+    """Gains of fields over others, by local linear regression in a Gaussian window (Fan and Gijbels 1996).
 
     Around a block the gain is linear, and such that the field and the gain times the other one have the same weighted
     sum and first moments in the window; a ridge holds its slope back where the pixels do not determine it.
@@ -41,78 +40,78 @@ class GainFit:
     ----------
     pixels
         P owned pixels.
-    weights : ndarray, shape (P,), float32
-        Weights of the pixels.
+    weights : ndarray, shape (k, P), float32
+        Weights of the pixels in each of the k fields.
     sigma
         Standard deviation of the window, px.
     side
         Of the blocks, px.
-    sums, totals : ndarray, shape (h, w)
-        Sums over blocks of the other field with the weights, and of these.
-    coefficients : ndarray, shape (3, h, w)
-        Factors that give the gain at a block from the weighted sums of a field and their first moments around it.
+    sums, totals : ndarray, shape (k, h, w)
+        Sums over blocks of the other fields with the weights, and of these.
+    coefficients : ndarray, shape (3, k, h, w)
+        Factors that give the gains at a block from the weighted sums of fields and their first moments around it.
     """
 
     pixels: PixelMap
     weights: FloatImage
     sigma: float
     side: int
-    sums: FloatArray
-    totals: FloatArray
-    coefficients: FloatArray
+    sums: FloatImage
+    totals: FloatImage
+    coefficients: FloatImage
 
     @classmethod
     def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
-        """Prepare the gain over `values` (P,) with `weights` (P,)."""
-        side = block_side(sigma)
-        sums, totals = pixels.weighted_block_sums(values, weights, side, with_weight=True)
-        total, x, y, xx, xy, yy = _moments(sums, sigma / side, 2)
+        """Prepare the gains over `values` (k, P) with `weights` (k, P)."""
+        side, count = block_side(sigma), len(values)
+        sums = pixels.weighted_block_sums(values, weights, side, with_weights=True)
+        total, x, y, xx, xy, yy = _moments(sums[:count].astype(np.float64), sigma / side, 2)
         # a ridge of half a per cent of the window's variance: beside gaps too narrow for a slope the mean counts. With
         # a tenth a slope of the light is followed too little at edges: coarse speckle errs there by twice as much
         spread = 0.005 * (sigma / side) ** 2 * total
         xx, yy = xx + spread, yy + spread
         cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
         determinant = (cofactors * (total, x, y)).sum(axis=0)
-        min_determinant = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
-        coefficients = np.where(
-            determinant > min_determinant, cofactors / np.maximum(determinant, min_determinant), 0.0
-        )
+        floor = 1e-6 * determinant.max(axis=(1, 2), keepdims=True, initial=0.0) + 1e-300
+        coefficients = np.where(determinant > floor, cofactors / np.maximum(determinant, floor), 0.0).astype(np.float32)
         return cls(
-            pixels=pixels, weights=weights, sigma=sigma, side=side, sums=sums, totals=totals, coefficients=coefficients
+            pixels=pixels,
+            weights=weights,
+            sigma=sigma,
+            side=side,
+            sums=sums[:count],
+            totals=sums[count:],
+            coefficients=coefficients,
         )
 
-    def block_sums(self, field: FloatImage) -> FloatArray:
-        """Sum a field (P,) with the weights over the blocks, (h, w)."""
-        return np.asarray(self.pixels.weighted_block_sums(field, self.weights, self.side)[0])
+    def block_sums(self, fields: FloatImage) -> FloatImage:
+        """Sum fields (k, P) with the weights over the blocks, (k, h, w)."""
+        return self.pixels.weighted_block_sums(fields, self.weights, self.side)
 
-    def gain(self, sums: FloatArray) -> FloatImage:
-        """Return the gain (h, w) at the blocks of a field with such `sums`."""
-        return np.asarray((self.coefficients * _moments(sums, self.sigma / self.side, 1)).sum(axis=0), dtype=np.float32)
+    def gains(self, sums: FloatImage) -> FloatImage:
+        """Return the gains (k, h, w) at the blocks of fields with such `sums`."""
+        return np.asarray((self.coefficients * _moments(sums, self.sigma / self.side, 1)).sum(axis=0))
 
-    def remainder(self, field: FloatImage, values: FloatImage) -> FloatImage:
-        """Return what a field (P,) has beyond its gain times the `values` (P,)."""
-        gain = self.pixels.from_blocks(self.gain(self.block_sums(field))[None], self.side)[0]
-        return np.asarray(field - gain * values)
-
-
-def local_gain_fits(
-    values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float | None
-) -> tuple[GainFit, ...]:
-    """Prepare the local gain over grey levels (k, P) in a window of `sigma` px; none where the gain is one number."""
-    if sigma is None:
-        return ()
-    return tuple(GainFit.over(f, w, pixels, sigma) for f, w in zip(values, weights, strict=True))
+    def remainder(self, fields: FloatImage, values: FloatImage) -> FloatImage:
+        """Return what fields (k, P) have beyond their gains times the `values` (k, P)."""
+        gains = self.pixels.from_blocks(self.gains(self.block_sums(fields)), self.side)
+        return np.asarray(fields - np.multiply(gains, values, out=gains))
 
 
-def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
-    """Moments 1, x, y of `order` 1, xx, xy, yy of 2, too, (3 or 6, h, w) about blocks in a window of `sigma` blocks."""
+def _moments(sums: AnyArray, sigma: float, order: int) -> AnyArray:
+    """Moments of grids (k, h, w) about each block in a window of `sigma` blocks, (3 or 6, k, h, w).
+
+    They are 1, x, y of `order` 1, and xx, xy, yy of 2, too.
+    """
     reach = int(np.ceil(4 * sigma))
     window, arm = cv2.getGaussianKernel(2 * reach + 1, sigma), np.arange(-reach, reach + 1.0)[:, None]
     kernels = window, arm * window, arm * arm * window
     powers = [(x, total - x) for total in range(order + 1) for x in range(total, -1, -1)]
-    return np.stack(
-        [cv2.sepFilter2D(sums, -1, kernels[x], kernels[y], borderType=cv2.BORDER_CONSTANT) for x, y in powers]
-    )
+    out = np.empty((len(powers), *sums.shape), dtype=sums.dtype)
+    for moments, (x, y) in zip(out, powers, strict=True):
+        for grid, moment in zip(sums, moments, strict=True):
+            cv2.sepFilter2D(grid, -1, kernels[x], kernels[y], dst=moment, borderType=cv2.BORDER_CONSTANT)
+    return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,42 +121,52 @@ class Brightness:
     Attributes
     ----------
     gain : ndarray, shape (k,)
-        Of each light; 1 where it shows nothing.
+        Of each light; NaN where it shows nothing.
     offset : ndarray, shape (k, 3)
         Of each light: its constant, and its slopes along the columns and rows of the rectangle around the pixels.
-    fits : tuple
-        `GainFit` of each light's local gain; None where the gain is one number.
+    fit : GainFit or None
+        Of the local gains; None where the gain is one number.
     """
 
     gain: FloatArray
     offset: FloatArray
-    fits: tuple[GainFit | None, ...]
+    fit: GainFit | None
 
-    def inverse_gain(
-        self, light: int, difference: FloatImage, shape: tuple[int, int], min_ratio: float
-    ) -> tuple[FloatImage, int]:
-        """Return 1 / a of a light from its difference f - g (P,), for `correct_brightness`, and the side of its blocks.
+    def inverse_gains(self, difference: FloatImage, shape: tuple[int, int], min_ratio: float) -> tuple[FloatImage, int]:
+        """Return 1 / a of the lights from their differences f - g (k, P), for `correct_brightness`.
 
-        It covers the rectangle of `shape` around the pixels. The local gain is that of these very grey levels, so that
-        a displacement leaves no gain behind. It is at least `min_ratio` of the light's gain.
+        The local gain is that of these very grey levels, so that a displacement leaves no gain behind. It is at least
+        `min_ratio` of the light's gain; a light that shows nothing has 1.
+
+        Returns
+        -------
+        inverse_gains : ndarray, shape (k, h + 2, W), float32
+            In rows of blocks that cover the rectangle of `shape` around the pixels, and one more all around.
+        side : int
+            Of the blocks, px.
         """
-        fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
-        if fit is None:
-            side, grid = max(shape), np.full((1, 1), 1 / gain)
+        one = np.float32(1)
+        gain = np.nan_to_num(self.gain, nan=1.0)[:, None, None].astype(np.float32)
+        if self.fit is None:
+            side, grids = max(shape), 1 / gain
         else:
-            side = fit.side
-            rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
+            side, (_, height, width) = self.fit.side, self.fit.sums.shape
+            rows, columns = np.ogrid[:height, :width]
             x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
-            plane = offset[0] + offset[1] * x + offset[2] * y
-            local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
-            grid = 1 / np.maximum(local, np.float32(min_ratio * gain))
-        if min(grid.shape) > 1:  # linear beyond the centres of the outermost blocks, too
-            grid = np.pad(grid, 1, mode="reflect", reflect_type="odd")
-            grid = np.clip(grid, 0, 1 / (min_ratio * gain), dtype=np.float32)
+            constant, along_x, along_y = self.offset.T[:, :, None, None]
+            plane = (constant + along_x * x + along_y * y).astype(np.float32)
+            local = self.fit.gains(self.fit.sums - self.fit.block_sums(difference) - plane * self.fit.totals)
+            grids = np.where(np.isfinite(self.gain[:, None, None]), 1 / np.maximum(local, min_ratio * gain), one)
+        margin = (0, 0), (1, 1), (1, 1)
+        if min(grids.shape[1:]) > 1:  # linear beyond the centres of the outermost blocks, too
+            grids = np.pad(grids, margin, mode="reflect", reflect_type="odd")
+            grids = np.clip(grids, 0, 1 / (min_ratio * gain))
         else:
-            grid = np.pad(grid, 1, mode="edge")
-        size = grid.shape[1] * side, grid.shape[0]
-        return np.asarray(cv2.resize(grid.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)), side
+            grids = np.pad(grids, margin, mode="edge")
+        out = np.empty((*grids.shape[:2], grids.shape[2] * side), dtype=np.float32)
+        for grid, image in zip(grids, out, strict=True):
+            cv2.resize(grid, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR)
+        return out, side
 
 
 ELEMENTS = 300
@@ -181,42 +190,54 @@ def gain_and_offset(moments: FloatArray, centres: FloatArray, min_correlation: f
         Correlation coefficient of both states from which an element counts; -1: all with a texture do.
     """
     gains, offsets = np.full(len(moments), np.nan), np.zeros((len(moments), 3))
-    for light, sums in enumerate(moments):
-        (total, f, g, *_), (fg, ff, gg) = sums.T, centred_products(sums)
-        total = np.maximum(total, 1e-30)
-        is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(ff * gg))
-        offsets[light, 0] = (g.sum() - f.sum()) / total.sum()
-        if is_correlated.sum() > 0.1 * (ff > 0).sum():
-            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // ELEMENTS]
-            gain = np.sqrt(gg[sample] / ff[sample])
-            gains[light] = np.median(gain)
-            offsets[light] = _offset_plane(centres[sample], (g[sample] - gain * f[sample]) / total[sample])
+    total, f, g = np.moveaxis(moments[..., :3], 2, 0)
+    fg, ff, gg = centred_products(moments)
+    offsets[:, 0] = (g.sum(axis=1) - f.sum(axis=1)) / np.maximum(total.sum(axis=1), 1e-30)
+    is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(np.maximum(ff * gg, 0)))
+    number = is_correlated.sum(axis=1)
+    lights = np.flatnonzero(number > 0.1 * (ff > 0).sum(axis=1))
+    if lights.size:  # all have samples of one size, in which elements of a light with fewer are repeated
+        count = min(int(number[lights].max()), ELEMENTS)
+        ranks = np.arange(count) * number[lights, None] // count
+        sample = np.stack(
+            [np.flatnonzero(is_correlated[light])[rank] for light, rank in zip(lights, ranks, strict=True)]
+        )
+        total, f, g, ff, gg = (values[lights[:, None], sample] for values in (total, f, g, ff, gg))
+        ratios = np.sqrt(gg / ff)
+        gains[lights] = np.median(ratios, axis=1)
+        offsets[lights] = _offset_planes(centres[sample], (g - ratios * f) / total, number[lights] >= 12)
     return gains, offsets
 
 
-def _offset_plane(points: FloatArray, values: FloatArray) -> FloatArray:
-    """Fit constant and slopes (3,) of a plane to offsets (M,) at points (M, 2), with Cauchy weights.
+def _offset_planes(points: FloatArray, values: FloatArray, is_fitted: BoolArray) -> FloatArray:
+    """Fit constants and slopes (k, 3) of planes to offsets (k, M) at points (k, M, 2), with Cauchy weights.
 
-    Reflections give single elements offsets, too: of the plane the fraction counts that it has of its mean square and
-    of the scatter about it together.
+    Reflections give single elements offsets, too: of a plane the fraction counts that it has of its mean square and
+    of the scatter about it together. What is not fitted, with fewer than four elements for each unknown, is constant.
     """
-    middle, size = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1.0)
-    basis = np.c_[np.ones(len(points)), (points - middle) / size]
-    plane, scatter = np.array([np.median(values), 0.0, 0.0]), _scatter(values - np.median(values))
-    for _ in range(3 if len(points) >= 12 else 0):  # of four elements for each unknown, until the scatter has settled
-        if not scatter:
-            break
-        plane = robust_fit(basis[None], values[None, :, None], 1e-3 * len(points), scatter)[0, :, 0]
-        scatter = _scatter(values - basis @ plane)
-    square = float(((basis @ plane) ** 2).mean())
-    plane = plane * square / max(square + scatter**2, 1e-300)
-    slopes = plane[1:] / size
-    return np.array([plane[0] - slopes @ middle, *slopes])
+    middle = points.mean(axis=1, keepdims=True)
+    size = np.maximum(np.ptp(points, axis=1).max(axis=1), 1.0)[:, None, None]
+    basis = np.concatenate([np.ones((*values.shape, 1)), (points - middle) / size], axis=2).transpose(0, 2, 1)
+    functions, held = np.concatenate([basis, values[:, None]], axis=1), np.diag([1e-6, *[1e-3 * values.shape[1]] * 2])
+    level = np.median(values, axis=1)
+    plane, scatter, weight = np.pad(level[:, None], ((0, 0), (0, 2))), _scatter(values - level[:, None]), np.float64(1)
+    for _ in range(10 if is_fitted.any() else 0):  # until weights and scatter have settled
+        # no BLAS, whose sums may depend on the number of threads
+        sums = np.einsum("kam,kbm->kab", basis * weight, functions)
+        fitted = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0]
+        plane = np.where(is_fitted[:, None], fitted, plane)
+        deviation = values - np.einsum("ka,kam->km", plane, basis)
+        scatter = _scatter(deviation)
+        weight = 1 / (1 + (deviation / np.where(scatter > 0, scatter, 1.0)[:, None]) ** 2)[:, None]
+    square = (np.einsum("ka,kam->km", plane, basis) ** 2).mean(axis=1)
+    plane *= (square / np.maximum(square + scatter**2, 1e-300))[:, None]
+    slopes = plane[:, 1:] / size[:, 0]
+    return np.column_stack([plane[:, 0] - (slopes * middle[:, 0]).sum(axis=1), slopes])
 
 
-def _scatter(values: FloatArray) -> float:
-    """Return the standard deviation of a normal distribution with the same median of the absolute values."""
-    return 1.5 * float(np.median(np.abs(values)))
+def _scatter(values: FloatArray) -> FloatArray:
+    """Return the standard deviation (k,) of normal distributions with the same median of the absolute values (k, M)."""
+    return np.asarray(1.5 * np.median(np.abs(values), axis=1))
 
 
 def window_width(

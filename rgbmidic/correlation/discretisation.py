@@ -22,7 +22,7 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import local_gain_fits
+from rgbmidic.correlation.brightness import Brightness, GainFit
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, gauss_newton_step
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
@@ -386,7 +386,8 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
     texture = reference.texture
     fields["texture"] = replace(texture, images=resample(texture.images), texture=resample(texture.texture))
     images = fields["values"], fields["pixel_weights"], pixels
-    fields |= {"gain_fits": local_gain_fits(*images, reference.gain_window), "assembly": Assembly.from_mesh(mesh)}
+    fit = reference.gain_fit and GainFit.over(*images, reference.gain_fit.sigma)
+    fields |= {"gain_fit": fit, "assembly": Assembly.from_mesh(mesh)}
     return replace(reference, mesh=mesh, material=mesh, pixels=pixels, **fields)
 
 
@@ -466,11 +467,11 @@ def _noise_residual(reference: Reference, noise: FloatImage, field: FloatArray) 
     motion = np.empty((2, noise.shape[1]), dtype=np.float32)
     interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, motion)
     difference = noise - reference.gradient[0] * motion[0] - reference.gradient[1] * motion[1]
-    weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
+    count = len(noise)
     return Residual(
         reference=reference,
-        brightness=reference.brightness_of(weights, np.zeros((len(noise), 1, 6)), np.zeros(len(noise), dtype=bool)),
-        weights=weights,
+        brightness=Brightness(gain=np.ones(count), offset=np.zeros((count, 3)), fit=None),
+        weights=reference.pixel_weights,
         difference=difference,
-        moments=moments,
+        moments=np.zeros((count, 0, 6)),
     )

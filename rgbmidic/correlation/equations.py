@@ -385,27 +385,25 @@ def _right_sides(
     estimate_difference: FloatImage | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
-    reference, assembly = equations.reference, problem.reference.assembly
+    reference, assembly, weights = equations.reference, problem.reference.assembly, equations.weights
     held = equations.held_side(reference, estimate.displacement)
-    total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
-    for light, displacement in enumerate(_light_displacements(problem, estimate)):
-        weight, gradient = equations.weights[light], reference.gradient[:, light]
-        if estimate_difference is not None:
-            projected = reference.projected(weight, estimate_difference[light], gradient)
-        else:
-            warp_arguments = reference.warp(problem.deformed, light, displacement)
-            differences(problem.deformed.coefficients[light], reference.values[light], *warp_arguments, difference)
-            fields = reference.brightness_fields(brightness, light, difference)
-            pixels, projected = reference.pixels, np.empty((len(reference.mesh.elements), 3, 2))
-            lines = pixels.lines, pixels.run_offsets
-            corrected_vector(weight, difference, *gradient, *fields, *lines, *pixels.positions, projected)
-        vector = assembly.vector(projected)
-        total += vector
-        if light:
-            rigid.append(equations.functions.T @ vector)
-    return total, held, np.concatenate(rigid) if rigid else np.empty(0)
+    if estimate_difference is not None:
+        projected = reference.projected(weights, estimate_difference, reference.gradient)
+    else:
+        deformed, pixels, difference = problem.deformed, reference.pixels, np.empty_like(reference.values)
+        for lights, warp in reference.warps(deformed, _light_displacements(problem, estimate)):
+            states = deformed.coefficients[lights], *deformed.weights.shape[1:], reference.values[lights]
+            differences(*states, *warp, pixels.offsets, difference[lights])
+        projected = np.empty((len(weights), len(reference.mesh.elements), 3, 2))
+        fields = weights, difference, *reference.gradient, *reference.brightness_fields(brightness, difference)
+        corrected_vector(*fields, *pixels.positions, projected)
+    vectors = [assembly.vector(light) for light in projected]
+    rigid = [equations.functions.T @ vector for vector in vectors[1:]]
+    return held + np.sum(vectors, axis=0), held, np.concatenate(rigid) if rigid else np.empty(0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:
     """Displacement (N, 2) of every light: the common one and its own rigid motion."""
+    if not problem.functions.size:
+        return [estimate.displacement] * len(estimate.rigid)
     return [estimate.displacement + (problem.functions @ rigid).reshape(-1, 2) for rigid in estimate.rigid]

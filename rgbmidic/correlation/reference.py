@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -12,11 +12,10 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import (
     BLOCK,
-    differences,
+    compare_states,
     element_hessian,
     element_sums,
     element_vector,
-    warped_weights,
 )
 from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
@@ -27,7 +26,6 @@ from rgbmidic.correlation.brightness import (
     BrightnessModel,
     GainFit,
     gain_and_offset,
-    local_gain_fits,
     window_width,
 )
 from rgbmidic.correlation.constants import USUAL, SolverConstants
@@ -190,8 +188,8 @@ class Reference(Derivable):
         One over the local mean of `values`, in units of which residual and gradient are.
     brightness
         ``solver.brightness``.
-    gain_fits : tuple of GainFit
-        Of each light's local gain with the `pixel_weights`; empty where the gain is one number.
+    gain_fit : GainFit or None
+        Of the lights' local gains with the `pixel_weights`; None where the gain is one number.
     gradient : ndarray, shape (2, k, P), float32
         Gradient of the texture common to the lights, as each shows it, in local means per px; without what is a gain.
     rim : ndarray, shape (P,), float32
@@ -223,7 +221,7 @@ class Reference(Derivable):
     weights: FloatImage
     values: FloatImage
     inverse_level: FloatImage
-    gain_fits: tuple[GainFit, ...]
+    gain_fit: GainFit | None
     brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
@@ -313,10 +311,11 @@ class Reference(Derivable):
         level = _local_level(values, weighted, pixels, sigma)
         if sigma is not None:
             weighted *= level > DARK * level.max()  # residuals are relative to it
-        inverse_level, fits = np.float32(1) / level, local_gain_fits(values, weighted, pixels, sigma)
-        for light, fit in enumerate(fits):
-            for axis in light_gradient[:, light]:
-                axis[:] = fit.remainder(axis, values[light])  # what a gain may be is no displacement
+        inverse_level, fit = np.float32(1) / level, None
+        if sigma is not None:
+            fit = GainFit.over(values, weighted, pixels, sigma)
+            for axis in light_gradient:
+                axis[:] = fit.remainder(axis, values)  # what a gain may be is no displacement
         light_gradient *= inverse_level
         texture = TextureGradient.of_images(light_gradient, weighted, pixels, constants.gradient_correlation_bounds)
         gradient = texture.matched(pixels)
@@ -333,7 +332,7 @@ class Reference(Derivable):
             weights=usable,
             values=values,
             inverse_level=inverse_level,
-            gain_fits=fits,
+            gain_fit=fit,
             brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
@@ -344,7 +343,7 @@ class Reference(Derivable):
             constants=constants,
         )
 
-    def brightness_of(self, weights: FloatImage, moments: FloatArray, is_changed: BoolArray) -> Brightness:
+    def brightness_of(self, weights: FloatImage, moments: FloatArray, is_changed: bool) -> Brightness:
         """Estimate gain and offset of deformed images.
 
         Parameters
@@ -353,8 +352,8 @@ class Reference(Derivable):
             Weights of the pixels that both states show.
         moments : ndarray, shape (k, E, 6)
             As of `Residual`.
-        is_changed : ndarray, shape (k,), bool
-            Lights whose weights are not the `pixel_weights`: where pixels are saturated, or off the frame.
+        is_changed
+            The weights are not the `pixel_weights`: where pixels are saturated, or off the frame.
 
         Returns
         -------
@@ -364,27 +363,19 @@ class Reference(Derivable):
         if self.brightness != "none":
             centres = self.mesh.centres - self.pixels.bounds[1::-1]
             gain, offset = gain_and_offset(moments, centres, self.constants.min_gain_correlation)
-        has_gain = np.isfinite(gain)
-        fits: list[GainFit | None] = [None] * len(weights)
-        for light, fit in enumerate(self.gain_fits):
-            if has_gain[light]:
-                fits[light] = fit
-                if is_changed[light]:
-                    fits[light] = GainFit.over(self.values[light], weights[light], self.pixels, fit.sigma)
-        return Brightness(gain=np.where(has_gain, gain, 1.0), offset=offset, fits=tuple(fits))
+        fit = self.gain_fit
+        if fit is not None and is_changed:
+            fit = GainFit.over(self.values, weights, self.pixels, fit.sigma)
+        return Brightness(gain=gain, offset=offset, fit=fit)
 
-    def brightness_fields(
-        self, brightness: Brightness, light: int, difference: FloatImage
-    ) -> tuple[AnyArray | int, ...]:
-        """Return what makes a light's residual ``(f - (g - b) / a) / level`` of its difference f - g, for kernels.
+    def brightness_fields(self, brightness: Brightness, difference: FloatImage) -> tuple[AnyArray | int, ...]:
+        """Return what makes residuals ``(f - (g - b) / a) / level`` of differences f - g, for kernels.
 
         Parameters
         ----------
         brightness
             Of the deformed images.
-        light
-            Index of the light.
-        difference : ndarray, shape (P,), float32
+        difference : ndarray, shape (k, P), float32
             Of the grey levels.
 
         Returns
@@ -392,14 +383,14 @@ class Reference(Derivable):
         tuple
             See `rgbmidic._kernels.owned_pixels.correct_brightness`.
         """
-        _, _, *shape = self.pixels.bounds
-        scales = brightness.inverse_gain(light, difference, (shape[0], shape[1]), self.constants.least_gain)
-        return self.values[light], self.inverse_level[light], *scales, brightness.offset[light]
+        height, width = self.pixels.bounds[2:]
+        scales = brightness.inverse_gains(difference, (height, width), self.constants.least_gain)
+        return self.values, self.inverse_level, *scales, brightness.offset, self.pixels.lines, self.pixels.run_offsets
 
     @property
     def gain_window(self) -> float | None:
         """Standard deviation (px) of the window of the gain; None where the gain is one number."""
-        return self.gain_fits[0].sigma if self.gain_fits else None
+        return None if self.gain_fit is None else self.gain_fit.sigma
 
     @property
     def relative_values(self) -> FloatImage:
@@ -449,8 +440,8 @@ class Reference(Derivable):
         add_second_derivatives(
             factors, self.images, self.pixels.lines, self.pixels.run_offsets, first_row, first_column, values
         )
-        fits = local_gain_fits(values, self.pixel_weights, self.pixels, self.gain_window)
-        return replace(self, values=values, gain_fits=fits)
+        fit = self.gain_fit and GainFit.over(values, self.pixel_weights, self.pixels, self.gain_fit.sigma)
+        return replace(self, values=values, gain_fit=fit)
 
     def with_gain_window(self, sigma: float) -> Reference:
         """Return the reference with a gain that is smooth over a narrower window.
@@ -464,11 +455,9 @@ class Reference(Derivable):
         -------
         Reference
         """
-        fits, gradient = local_gain_fits(self.values, self.pixel_weights, self.pixels, sigma), self.gradient.copy()
-        for light, fit in enumerate(fits):
-            for axis in gradient[:, light]:
-                axis[:] = fit.remainder(axis / self.inverse_level[light], self.values[light])
-        return replace(self, gain_fits=fits, gradient=gradient * self.inverse_level)
+        fit = GainFit.over(self.values, self.pixel_weights, self.pixels, sigma)
+        gradient = np.stack([fit.remainder(axis / self.inverse_level, self.values) for axis in self.gradient])
+        return replace(self, gain_fit=fit, gradient=gradient * self.inverse_level)
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
@@ -485,8 +474,10 @@ class Reference(Derivable):
         """
         return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
-    def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> tuple[AnyArray, ...]:
-        """Return where a light's deformed image shows the pixels, for a displacement; see `warp_arguments`.
+    def warps(
+        self, deformed: Deformed, displacements: Sequence[FloatArray]
+    ) -> Iterator[tuple[slice, tuple[AnyArray, ...]]]:
+        """Yield lights that move alike, and where their deformed images show the pixels; see `warp_arguments`.
 
         A light's registration is part of it, as linear in each element as the displacement, here and in the reference's
         own grey levels: what the elements do not follow of it cancels.
@@ -495,19 +486,20 @@ class Reference(Derivable):
         ----------
         deformed
             The deformed images.
-        light
-            Index of the light.
-        displacement : ndarray, shape (N, 2)
-            Nodal displacement in px.
+        displacements : sequence of ndarray, shape (N, 2)
+            Nodal displacement of each light in px.
 
-        Returns
-        -------
-        tuple of ndarray
+        Yields
+        ------
+        slice, tuple of ndarray
         """
-        motion = displacement - self.offset(deformed)
-        if self.registration is not None:
-            motion = motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light)
-        return warp_arguments(self.mesh, self.pixels, motion)
+        is_common = self.registration is None and all(one is displacements[0] for one in displacements)
+        for light, displacement in enumerate(displacements[:1] if is_common else displacements):
+            motion = displacement - self.offset(deformed)
+            if self.registration is not None:
+                motion = motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light)
+            lights = slice(None) if is_common else slice(light, light + 1)
+            yield lights, warp_arguments(self.mesh, self.pixels, motion)
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,).
@@ -542,25 +534,26 @@ class Reference(Derivable):
         """
         return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
-    def projected(self, weight: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
-        """Sum a light's right-hand side over each element: ``sum w (f - g) grad f phi``, for fields (P,).
+    def projected(self, weights: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
+        """Sum the right-hand sides of lights over each element: ``sum w (f - g) grad f phi``.
 
         Parameters
         ----------
-        weight : ndarray, shape (P,)
+        weights : ndarray, shape (k, P) or (P,)
             Weight w of every owned pixel.
-        difference : ndarray, shape (P,)
+        difference : ndarray, shape (k, P) or (P,)
             Difference f - g of the grey levels.
-        gradient : iterable of ndarray, shape (P,)
+        gradient : iterable of ndarray, shape (k, P) or (P,)
             Gradient of the grey level along x and y.
 
         Returns
         -------
-        ndarray, shape (E, 3, 2)
+        ndarray, shape (k, E, 3, 2) or (E, 3, 2)
             By element, corner and axis.
         """
-        vectors = np.empty((len(self.mesh.elements), 3, 2))
-        element_vector(weight, difference, *gradient, *self.pixels.positions, vectors)
+        vectors = np.empty((*weights.shape[:-1], len(self.mesh.elements), 3, 2))
+        fields = (np.atleast_2d(field) for field in (weights, difference, *gradient))
+        element_vector(*fields, *self.pixels.positions, vectors.reshape(-1, *vectors.shape[-3:]))
         return vectors
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
@@ -632,15 +625,14 @@ def _sample_registered_lights(
     gradient, shift = (
         np.empty((2, *leading_shape, inside.size), dtype=np.float32) for leading_shape in (values.shape[:1], ())
     )
-    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
-    is_changed = np.empty(len(mesh.elements), dtype=bool)
+    zero, unused, moments = np.zeros_like(inside[None]), np.empty_like(inside), np.empty((1, len(mesh.elements), 6))
+    is_changed = np.ones(moments.shape[:2], dtype=bool)
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
-        warp, spline = warp_arguments(mesh, pixels, motion), state.coefficients[light]
-        differences(spline, zero, *warp, values[light])
-        images = state.weights[light], state.nonuniform_weight_blocks[light], zero, values[light], inside
-        warped_weights(*images, *warp, weights[light], moments, is_changed)
+        one, warp = slice(light, light + 1), warp_arguments(mesh, pixels, motion)
+        images = state.coefficients[one], state.weights[one], zero, inside[None], is_changed
+        compare_states(*images, *warp, pixels.offsets, values[one], weights[one], moments)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
-        sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
+        sample_with_gradient(state.coefficients[light], x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient
 
 

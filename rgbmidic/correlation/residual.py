@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
+from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
@@ -77,21 +77,20 @@ class Residual:
         -------
         Residual
         """
-        values = reference.values
-        difference, weights = np.empty_like(values), np.empty_like(values)
-        moments = np.empty((len(values), len(reference.mesh.elements), 6))
+        values, pixels, shape = reference.values, reference.pixels, deformed.weights.shape[1:]
+        moments, difference = np.empty((len(values), len(reference.mesh.elements), 6)), np.empty_like(values)
         is_changed = np.empty(moments.shape[:2], dtype=bool)
-        for light, displacement in enumerate(displacements):
-            warp = reference.warp(deformed, light, displacement)
-            differences(deformed.coefficients[light], values[light], *warp, difference[light])
-            images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
-            states = *images, reference.pixel_weights[light]
-            warped_weights(*states, *warp, weights[light], moments[light], is_changed[light])
-        brightness = reference.brightness_of(weights, moments, np.asarray(is_changed.any(axis=1)))
-        for light, light_difference in enumerate(difference):
-            fields = reference.brightness_fields(brightness, light, light_difference)
-            pixels = reference.pixels
-            correct_brightness(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, light_difference)
+        warps = list(reference.warps(deformed, displacements))
+        for lights, warp in warps:
+            find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
+        weights = reference.pixel_weights.copy() if is_changed.any() else reference.pixel_weights
+        for lights, warp in warps:
+            states = deformed.coefficients[lights], deformed.weights[lights], values[lights]
+            reference_weights = reference.pixel_weights[lights], is_changed[lights]
+            outputs = difference[lights], weights[lights], moments[lights]
+            compare_states(*states, *reference_weights, *warp, pixels.offsets, *outputs)
+        brightness = reference.brightness_of(weights, moments, bool(is_changed.any()))
+        correct_brightness(*reference.brightness_fields(brightness, difference), pixels.offsets, difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -168,11 +167,11 @@ class Residual:
         pixels, window = self.reference.pixels, self.reference.gain_window
         if window is None:
             return 0.0
-        smooth, side = 0.0, block_side(window)
-        for residual, weight in zip(self.difference, self.weights, strict=True):
-            sums, total = pixels.weighted_block_sums(residual, weight, side, with_weight=True)
-            smooth += float((sums**2 / np.maximum(total, 1e-30)).sum())
-        return smooth / max(float(self.squares(self.weights)[..., 0].sum()), 1e-300)
+        sums = pixels.weighted_block_sums(self.difference, self.weights, block_side(window), with_weights=True)
+        smooth, total = sums.reshape(2, -1).astype(np.float64)
+        return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(
+            float(self.squares(self.weights)[..., 0].sum()), 1e-300
+        )
 
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.

@@ -203,28 +203,28 @@ class PixelMap:
         return out
 
     def weighted_block_sums(
-        self, values: FloatImage, weight: FloatImage, side: int, *, with_weight: bool = False
-    ) -> FloatArray:
-        """Sum `values` (P,) times a `weight` (P,) over such blocks, and the weight too where asked for.
+        self, values: FloatImage, weights: FloatImage, side: int, *, with_weights: bool = False
+    ) -> FloatImage:
+        """Sum `values` (k, P) times their `weights` (k, P) over such blocks, and then the weights where asked for.
 
         Parameters
         ----------
-        values : ndarray, shape (P,), float32
-            A field at the owned pixels.
-        weight : ndarray, shape (P,), float32
-            Its weight.
+        values : ndarray, shape (k, P), float32
+            Fields at the owned pixels.
+        weights : ndarray, shape (k, P), float32
+            Their weights.
         side
             Side of the blocks in px.
-        with_weight
-            Whether the sums of the weight are returned, too.
+        with_weights
+            Whether the sums of the weights are returned, too.
 
         Returns
         -------
-        ndarray, shape (1 or 2, rows, columns), float64
+        ndarray, shape (k or 2 k, rows, columns), float32
         """
-        out = np.empty((1 + with_weight, *self.grid(side)), dtype=np.float32)
-        weighted_block_sums(values, weight, self.lines, self.run_offsets, side, out)
-        return out.astype(np.float64)
+        out = np.empty((len(values) * (1 + with_weights), *self.grid(side)), dtype=np.float32)
+        weighted_block_sums(values, weights, self.lines, self.run_offsets, side, out)
+        return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P).

@@ -69,12 +69,14 @@ def test_a_gain_that_is_linear_is_found_up_to_every_edge(pixels):
     random, shape = np.random.default_rng(0), pixels.bounds[2:]
     values = random.uniform(50, 150, pixels.columns.size).astype(np.float32)
     gain = 0.5 + 0.004 * pixels.columns + 0.003 * pixels.rows
-    fit = GainFit.over(values, np.ones_like(values), pixels, 10.0)
+    lights = np.stack([values, values])
+    fit = GainFit.over(lights, np.ones_like(lights), pixels, 10.0)
     field = (gain * values).astype(np.float32)
-    assert np.abs(fit.remainder(field, values)).max() < 0.05 * field.max()
-    brightness = Brightness(gain=np.ones(1), offset=np.zeros((1, 3)), fits=(fit,))
-    inverse = at_pixels(pixels, *brightness.inverse_gain(0, values - field, shape, 0.05))
-    np.testing.assert_allclose(1 / inverse, gain, rtol=0.01)
+    assert np.abs(fit.remainder(np.stack([field, field]), lights)).max() < 0.05 * field.max()
+    brightness = Brightness(gain=np.array([1.0, np.nan]), offset=np.zeros((2, 3)), fit=fit)
+    (first, second), side = brightness.inverse_gains(lights - field, shape, 0.05)
+    np.testing.assert_allclose(1 / at_pixels(pixels, first, side), gain, rtol=0.01)
+    assert (second == 1).all()  # of the second light nothing is seen
 
 
 def at_pixels(pixels: PixelMap, scales: np.ndarray, side: int) -> np.ndarray:
@@ -94,34 +96,37 @@ def test_an_offset_is_a_plane_whatever_some_elements_show():
     gain, offset = gain_and_offset(sums[None], centres, USUAL.min_gain_correlation)
     assert gain[0] == pytest.approx(0.6, rel=1e-6)
     np.testing.assert_allclose(offset[0, 0] + centres @ offset[0, 1:], plane, atol=0.8)
-    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL.min_gain_correlation)
-    assert np.isnan(unlike[0][0])
-    np.testing.assert_allclose(unlike[1], [[-f.mean(), 0.0, 0.0]])
+    dark, few = sums * (1, 1, 0, 1, 0, 0), sums * np.repeat([[0], [1]], [35, 45], axis=0)
+    together = gain_and_offset(np.stack([dark, few, sums]), centres, USUAL.min_gain_correlation)
+    assert np.isnan(together[0][0])
+    np.testing.assert_allclose(together[1][0], [-f.mean(), 0.0, 0.0])
+    np.testing.assert_allclose(together[1][1, 0] + centres @ together[1][1, 1:], plane, atol=0.8)
+    np.testing.assert_allclose(together[1][2], offset[0], rtol=1e-12)  # whatever the other lights show
 
 
 @pytest.mark.parametrize("side", [4, 200])
 def test_the_corrected_difference_is_that_of_the_naive_one(pixels, side):
     random = np.random.default_rng(2)
-    f, level, before = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
-    (height, width), offset = pixels.bounds[2:], np.array([3.0, 0.1, -0.2])
-    scales = random.uniform(0.2, 2, (-(-height // side) + 2, side * (-(-width // side) + 2))).astype(np.float32)
-    brightness, lines = (f, 1 / level, scales, side, offset), (pixels.lines, pixels.run_offsets)
-    difference = before.copy()
-    correct_brightness(*brightness, *lines, pixels.offsets, difference)
-    top, left = pixels.bounds[:2]
-    rows, columns = pixels.rows - top, pixels.columns - left
-    a, b = at_pixels(pixels, scales, side), offset[0] + offset[1] * columns + offset[2] * rows
-    np.testing.assert_allclose(difference, (f - a * (f - before - b)) / level, rtol=1e-3, atol=1e-3)
-    projected, expected = np.empty((2, len(pixels.origin), 3, 2))
-    corrected_vector(f, before, level, level - 100, *brightness, *lines, *pixels.positions, projected)
+    f, level, before = random.uniform(50, 150, (3, 2, pixels.columns.size)).astype(np.float32)
+    (height, width), offset = pixels.bounds[2:], np.array([[3.0, 0.1, -0.2], [0, 0, 0]])
+    scales = random.uniform(0.2, 2, (2, -(-height // side) + 2, side * (-(-width // side) + 2))).astype(np.float32)
+    brightness, difference = (f, 1 / level, scales, side, offset, pixels.lines, pixels.run_offsets), before.copy()
+    correct_brightness(*brightness, pixels.offsets, difference)
+    positions = [np.ones(f.shape[1]), pixels.columns - pixels.bounds[1], pixels.rows - pixels.bounds[0]]
+    for light in (0, 1):
+        a, b = at_pixels(pixels, scales[light], side), offset[light] @ positions
+        expected = (f[light] - a * (f[light] - before[light] - b)) / level[light]
+        np.testing.assert_allclose(difference[light], expected, rtol=1e-3, atol=1e-3)
+    projected, expected = np.empty((2, 2, len(pixels.origin), 3, 2))
+    corrected_vector(f, before, level, level - 100, *brightness, *pixels.positions, projected)
     element_vector(f, difference, level, level - 100, *pixels.positions, expected)
     np.testing.assert_allclose(projected, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
 def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
-    values, weight = np.random.default_rng(3).uniform(0, 1, (2, pixels.columns.size)).astype(np.float32)
-    found = pixels.weighted_block_sums(values, weight, 4, with_weight=True)
-    np.testing.assert_allclose(found, pixels.block_sums(np.stack([weight * values, weight]), 4), rtol=1e-6)
+    values, weights = np.random.default_rng(3).uniform(0, 1, (2, 2, pixels.columns.size)).astype(np.float32)
+    found = pixels.weighted_block_sums(values, weights, 4, with_weights=True)
+    np.testing.assert_allclose(found, pixels.block_sums(np.concatenate([weights * values, weights]), 4), rtol=1e-6)
 
 
 def test_images_about_zero_have_no_gain_and_are_refused_in_one_line() -> None:

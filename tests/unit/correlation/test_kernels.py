@@ -107,23 +107,12 @@ def test_gradients_at_the_owned_pixels_equal_the_naive_twin(outlined):
     close(out, naive.sample_with_gradient(case.coefficients, case.pixels.columns, case.pixels.rows)[1:])
 
 
-@pytest.mark.parametrize("outlined", [False, True])
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_differences_equal_the_naive_twin(motion, outlined):
-    case = scene(3, motion, outlined=outlined)
-    out = np.full(case.reference.size, 7, dtype=np.float32)
-    kernels.differences(case.coefficients, case.reference, *moved(case), out)
-    expected = np.nan_to_num(case.reference - naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
-    np.testing.assert_allclose(out, expected, atol=0.02)
-    assert (out == 0).all() == (motion == "far outside")
-
-
 def test_an_invalid_coefficient_reaches_the_pixels_around_it_only():
     case = scene(4, "none")
-    clean, dirty = np.empty((2, case.reference.size), dtype=np.float32)
-    kernels.differences(case.coefficients, case.reference, *moved(case), clean)
+    weights = np.ones(SHAPE, np.float32), case.weight
+    clean = compared(case, *weights)[0]
     case.coefficients[15 + PAD, 18 + PAD] = np.nan
-    kernels.differences(case.coefficients, case.reference, *moved(case), dirty)
+    dirty = compared(case, *weights)[0]
     touched = np.isnan(naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
     np.testing.assert_array_equal(np.isnan(dirty), touched)
     assert touched.any()
@@ -154,9 +143,10 @@ def block_products(case, sign, side, apart, fill=0.0):
     return out
 
 
+@pytest.mark.parametrize("outlined", [False, True])
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_what_is_brought_back_equals_the_naive_twins(motion):
-    case = scene(6, motion)
+def test_compared_states_equal_the_naive_twins(motion, outlined):
+    case = scene(6, motion, outlined=outlined)
     given = case.random.uniform(0.2, 1, SHAPE).astype(np.float32)
     given[case.random.random(SHAPE) < 0.1] = 0
     given[4:25, 5:30] = 1
@@ -172,16 +162,28 @@ def test_what_is_brought_back_equals_the_naive_twins(motion):
 
 
 def compared(case, given, weight):
-    """Difference, weight and moments for a deformed weight (H, W) and a reference weight (P,)."""
-    difference, found = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
-    moments = np.full((len(case.mesh.elements), 6), 7.0)
-    kernels.differences(case.coefficients, case.reference, *moved(case), difference)
-    images = given, _count_nonuniform_blocks(given), case.reference, difference, weight
-    is_changed = np.empty(len(moments), dtype=bool)
-    kernels.warped_weights(*images, *moved(case), found, moments, is_changed)
-    is_same = ~np.repeat(is_changed, np.diff(case.pixels.offsets))
-    np.testing.assert_array_equal(found[is_same], weight[is_same])
-    return difference, found, moments
+    """Difference, weight and moments for a deformed weight (H, W) and a reference weight (P,): of two lights alike."""
+    difference, found = np.full((2, 2, case.pixels.rows.size), 7, dtype=np.float32)
+    moments, is_changed = (
+        np.full((2, len(case.mesh.elements), 6), 7.0),
+        np.empty((2, len(case.mesh.elements)), dtype=bool),
+    )
+    kernels.find_changed_weights(twice(_count_nonuniform_blocks(given)), *given.shape, *moved(case), is_changed)
+    found[:] = weight
+    images = map(twice, (case.coefficients, given, case.reference, weight))
+    kernels.compare_states(*images, is_changed, *moved(case), case.pixels.offsets, difference, found, moments)
+    for output in (difference, found, moments, is_changed):
+        np.testing.assert_array_equal(*output)
+    again = np.full_like(difference, 7)
+    kernels.differences(
+        twice(case.coefficients), *given.shape, twice(case.reference), *moved(case), case.pixels.offsets, again
+    )
+    np.testing.assert_array_equal(again, difference)
+    return difference[0], found[0], moments[0]
+
+
+def twice(field):
+    return np.stack([field, field])
 
 
 def test_without_motion_the_image_comes_back_up_to_its_last_row_and_column():
@@ -209,9 +211,10 @@ def test_sums_over_elements_equal_their_naive_twins():
 
 def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
     case = scene(10, outlined=True)
-    out = np.full((len(case.mesh.elements), 3, 2), 7.0)
-    kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, out)
-    close(out, naive.element_vector(case.weight, case.reference, *case.gradient, case.pixels), scale=1e3)
+    out, fields = np.full((2, len(case.mesh.elements), 3, 2), 7.0), (case.weight, case.reference, *case.gradient)
+    kernels.element_vector(*map(twice, fields), *case.on_map, case.pixels.barycentric, out)
+    for light in out:
+        close(light, naive.element_vector(*fields, case.pixels), scale=1e3)
     fields = np.full((2, case.reference.size), 7, dtype=np.float32)
     owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     np.testing.assert_allclose(fields, naive.interpolate_nodal(case.displacement, case.pixels, case.mesh), atol=1e-5)
@@ -259,13 +262,14 @@ def all_outputs():
     """What every parallel kernel writes."""
     case = scene(11, "over the edge", shape=(151, 173))
     elements, count = len(case.mesh.elements), case.reference.size
-    hessian, vector = np.empty((elements, 3, 3, 3)), np.empty((elements, 3, 2))
+    hessian, vector = np.empty((elements, 3, 3, 3)), np.empty((2, elements, 3, 2))
     squares, sums, fields = np.empty((2, elements, 3)), np.empty((2, elements, 2)), np.empty((2, count), np.float32)
     kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, hessian)
     difference, weights, moments = compared(case, case.image, case.weight)
     kernels.element_squares(case.gradient, case.gradient**2, case.pixels.offsets, squares)
     kernels.element_sums(case.gradient, case.weight, case.pixels.offsets, sums)
-    kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, vector)
+    pairs = map(twice, (case.weight, case.reference, *case.gradient))
+    kernels.element_vector(*pairs, *case.on_map, case.pixels.barycentric, vector)
     owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)

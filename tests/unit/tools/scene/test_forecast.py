@@ -46,10 +46,10 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
     pixels = PixelMap.from_mesh(mesh, region)
     recovery = Recovery.over(mesh, mesh.areas > 0, np.ones(len(mesh.nodes)))
     noise = np.random.default_rng(0).normal(size=(400, pixels.rows.size)).astype(np.float32)
-    parts, loads = np.zeros((len(mesh.elements), 3, 2)), []
+    parts, loads = np.zeros((1, len(mesh.elements), 3, 2)), []
     for first, second in noise.reshape(-1, 2, pixels.rows.size):
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-        element_vector(*np.ones_like([first, second]), first, second, *geometry, parts)
+        element_vector(*np.ones((2, 1, first.size), np.float32), first[None], second[None], *geometry, parts)
         loads += [np.bincount(mesh.elements.ravel(), weights=parts[..., c].ravel()) for c in (0, 1)]
     recovered = recovery.value @ np.linalg.solve(mesh.mass_matrix.toarray(), np.transpose(loads))
     inner = (abs(mesh.nodes - 75) < 40).all(axis=1)  # as many nodes with eight triangles as with four
