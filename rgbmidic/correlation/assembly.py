@@ -339,8 +339,8 @@ def mean_residual_leverage(
     nodal_texture = np.bincount(mesh.elements.ravel(), weights=element_texture, minlength=len(mesh.nodes))
     limits = np.array([side * rows, side * columns]) - 1
     row, column = (np.clip(mesh.nodes[:, ::-1] - (first_row, first_column), 0, limits) // side).astype(int).T
-    block_grids = (np.bincount(row * columns + column, values, rows * columns) for values in (fitted, nodal_texture))
-    smoothed_grids = [window_sums(grid.reshape(rows, columns), constants.score_range / side) for grid in block_grids]
+    block_sums = [np.bincount(row * columns + column, values, rows * columns) for values in (fitted, nodal_texture)]
+    smoothed_grids = window_sums(np.reshape(block_sums, (2, rows, columns)), constants.score_range / side)
     centre = mesh.centres[:, ::-1] - (first_row, first_column)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     local_texture = np.maximum(smoothed_grids[1][row, column], np.finfo(float).tiny)

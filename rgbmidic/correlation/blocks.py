@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,17 +93,12 @@ class BlockTable:
             Mean over the window, of each direction.
         """
         score, axis_information = self.sums[:, :2], self.sums[:, 2] / 2
-        information = np.maximum(self._mean(axis_information, range_), 1e-30)
-        displacement = self._mean(score, range_) / information[:, None]
+        information = np.maximum(window_sums(axis_information, range_ / self.side), 1e-30)
+        displacement = window_sums(score, range_ / self.side) / information[:, None]
         blocks = 4 * np.pi * (range_ / self.side) ** 2  # that a window holds
         square = ((score - displacement * axis_information[:, None]) ** 2).mean(axis=1)
-        mean_square = self._mean(square, self.reference.constants.bias_range)
+        mean_square = window_sums(square, self.reference.constants.bias_range / self.side)
         return displacement, mean_square / information**2 / blocks, information
-
-    def _mean(self, grids: FloatArray, range_: float) -> FloatArray:
-        """Mean of grids (..., h, w) over a window of a standard deviation of so many px."""
-        means = [window_sums(grid, range_ / self.side) for grid in grids.reshape(-1, *grids.shape[-2:])]
-        return np.reshape(means, grids.shape)
 
     def design_effect(self) -> FloatArray:
         """Variance of the scores over their information: products xx, xy, yy of each light, (k, 3, h, w).
@@ -115,36 +109,29 @@ class BlockTable:
         constants = self.reference.constants
         prior = constants.prior_blocks * self.side**2
         window = 4 * np.pi * (constants.score_range / self.side) ** 2
-        effects = []
-        for score, count in zip(self._relative(self.sums[:, :2]), self.sums[:, 3], strict=True):
-            (x, y), typical, pixel_count = score, _typical_square(score, count), self.windowed_sums(count)
-            # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too
-            # large; of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
-            number = np.minimum(window * pixel_count, count.sum()) / self.side**2
-            small_sample_factor = number / np.maximum(number - 1, 0.25)
-            products = (x * x, typical), (x * y, 0.0), (y * y, typical)
-            effects.append(
-                [
-                    (self.windowed_sums(square) + prior * mean) / (pixel_count + prior) * small_sample_factor
-                    for square, mean in products
-                ]
-            )
-        return np.array(effects)
+        scores, counts = self._relative(self.sums[:, :2]), self.sums[:, 3]
+        pixel_counts = self.windowed_sums(counts)
+        # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large;
+        # of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
+        number = np.minimum(window * pixel_counts, counts.sum(axis=(1, 2), keepdims=True)) / self.side**2
+        small_sample_factor = number / np.maximum(number - 1, 0.25)
+        typical = prior * np.multiply.outer(_typical_squares(scores, counts), [1.0, 0.0, 1.0])[:, :, None, None]
+        products = self.windowed_sums(scores[:, [0, 0, 1]] * scores[:, [0, 1, 1]])
+        effects = (products + typical) / (pixel_counts + prior)[:, None] * small_sample_factor[:, None]
+        return np.asarray(effects)
 
     def correlation(self) -> FloatArray:
         """Correlation of the scores of each two lights over the blocks around that both see, (k, k, h, w)."""
-        scores, counts, lights = self._relative(self.sums[:, :2]), self.sums[:, 3], range(len(self.sums))
+        scores, counts = self._relative(self.sums[:, :2]), self.sums[:, 3]
         prior = self.reference.constants.prior_blocks * self.side**2
-        typical = [2 * prior * _typical_square(score, count) for score, count in zip(scores, counts, strict=True)]
-        out = np.zeros((len(scores), *counts.shape))
-        for a, b in product(lights, lights):
-            common = (counts[a] > 0) & (counts[b] > 0)
-            along, *squares = (
-                self.windowed_sums(common * (scores[i] * scores[j]).sum(axis=0)) for i, j in ((a, b), (a, a), (b, b))
-            )
-            scale = np.sqrt((squares[0] + typical[a]) * (squares[1] + typical[b]))
-            np.divide(along, scale, out=out[a, b], where=scale > 0)
-        return out
+        typical = 2 * prior * _typical_squares(scores, counts)[:, None, None]
+        a, b = np.indices((len(counts), len(counts)))
+        common = (counts[a] > 0) & (counts[b] > 0)
+        along, first, second = (
+            self.windowed_sums(common * (scores[i] * scores[j]).sum(axis=2)) for i, j in ((a, b), (a, a), (b, b))
+        )
+        scale = np.sqrt((first + typical[a]) * (second + typical[b]))
+        return np.asarray(np.divide(along, scale, out=np.zeros_like(along), where=scale > 0))
 
     def sensitivity(self, points: FloatArray) -> FloatArray:
         """Texture of the deformed image over that of the reference, along the gradient of the latter, at points (M, 2).
@@ -154,16 +141,16 @@ class BlockTable:
         reference, deformed = self.at(self.sums[0, 4:], points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
-    def windowed_sums(self, grid: AnyArray) -> AnyArray:
-        """Sums of a grid over the window in which scores are averaged, up to a factor."""
-        return window_sums(grid, self.reference.constants.score_range / self.side)
+    def windowed_sums(self, grids: AnyArray) -> AnyArray:
+        """Sums of grids (..., h, w) over the window in which scores are averaged, up to a factor."""
+        return window_sums(grids, self.reference.constants.score_range / self.side)
 
     def typical_ratio(self, scores: FloatArray) -> float:
         """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
         numerator, denominator = (
-            _typical_square(self._relative(values[None])[0], self.sums[0, 3]) for values in (scores, self.sums[0, :2])
+            _typical_squares(self._relative(values[None]), self.sums[:, 3])[0] for values in (scores, self.sums[0, :2])
         )
-        return numerator / denominator if denominator > 0 else 0.0
+        return float(numerator / denominator) if denominator > 0 else 0.0
 
     def _relative(self, scores: FloatArray) -> FloatArray:
         """Scores (k, 2, h, w) over the root of the information around them.
@@ -171,19 +158,23 @@ class BlockTable:
         A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
         smooth, and averaged, is its ratio to the information.
         """
-        smoothing, out = self.reference.constants.information_smoothing, np.zeros_like(scores)
-        for (information, count), score, relative in zip(self.sums[:, 2:4], scores, out, strict=True):
-            level = window_sums(information, smoothing) / np.maximum(window_sums(count, smoothing), 1e-6)
-            np.divide(score, np.sqrt(level), out=relative, where=(level > 0) & (count > 0))
-        return out
+        counts = self.sums[:, 3]
+        information, pixels = window_sums(self.sums[:, 2:4], self.reference.constants.information_smoothing).swapaxes(
+            0, 1
+        )
+        level = information / np.maximum(pixels, 1e-6)
+        usable = ((level > 0) & (counts > 0))[:, None]
+        return np.asarray(np.divide(scores, np.sqrt(level)[:, None], out=np.zeros_like(scores), where=usable))
 
 
-def _typical_square(score: FloatArray, count: FloatArray) -> float:
-    """Square of a relative score (2, h, w) in one direction, per pixel, typical of the region's blocks.
+def _typical_squares(scores: FloatArray, counts: FloatArray) -> FloatArray:
+    """Square (k,) of relative scores (k, 2, h, w) in one direction, per pixel, typical of the region's blocks.
 
     A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
     distributed exponentially, with a median of 2 ln 2 variances.
     """
-    is_full = count >= 0.5 * count.max(initial=0.0)
-    square = (score**2).sum(axis=0)[is_full] / np.maximum(count[is_full], 1.0)
-    return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
+    typical = np.zeros(len(scores))
+    for light, (square, count) in enumerate(zip((scores**2).sum(axis=1), counts, strict=True)):
+        if (is_full := count >= 0.5 * count.max(initial=0.0)).any():
+            typical[light] = np.median(square[is_full] / np.maximum(count[is_full], 1.0)) / (2 * np.log(2))
+    return typical

@@ -12,9 +12,12 @@ from rgbmidic.mesh.pixel_map import PixelMap
 from rgbmidic.typing import AnyArray, FloatImage
 
 
-def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
-    """Sum a grid (h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grid there is nothing."""
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
+def window_sums(grids: AnyArray, sigma: float) -> AnyArray:
+    """Sum grids (..., h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grids there is nothing."""
+    sums = np.empty(grids.shape, grids.dtype)  # whose grids are contiguous, whatever those given are
+    for index in np.ndindex(grids.shape[:-2]):
+        cv2.GaussianBlur(grids[index], (0, 0), sigma, dst=sums[index], borderType=cv2.BORDER_CONSTANT)
+    return sums
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +58,7 @@ class SlidingWindow:
     def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
         """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
         sigma = self.sigma / self.step
-        means, weight_means = (np.stack([window_sums(grid, sigma) for grid in grids]) for grids in (totals, weights))
+        means, weight_means = (window_sums(grids, sigma) for grids in (totals, weights))
         means /= np.maximum(weight_means, np.float32(1e-6), out=weight_means)
         return np.asarray(means, dtype=np.float32)
 

@@ -194,7 +194,7 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     RgbmidicError
         The frame cannot be read or is not what the settings say.
     """
-    settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
+    settings, reference = plan.settings, plan.reference
     position = plan.series.selected.index(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
@@ -209,7 +209,8 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     with stage("separation"):
         images = light_images(plan.separation, state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
-        raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
+        name, shapes = plan.series.name(index), (images.values.shape, reference.images.shape)
+        raise FrameError("{} has the shape {}, the reference {}".format(name, *shapes))
     with stage("preparation"):
         grey_levels, weights = plan.prepared(images, index)
         deformed = Deformed.prepare(grey_levels, weights, prefilter=settings.solver.prefilter, origin=window.origin)
