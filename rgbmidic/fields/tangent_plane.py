@@ -78,7 +78,7 @@ def _deformation(tangents: FloatArray, slopes: FloatArray) -> tuple[FloatArray, 
     to_axes = np.linalg.inv(tangent_axes(tangents).transpose(0, 2, 1) @ tangents)
     gradient = (tangents + slopes) @ to_axes
     left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
-    return gradient, (left_vectors @ right_vectors).transpose(0, 2, 1), to_axes
+    return np.asarray(gradient), (left_vectors @ right_vectors).transpose(0, 2, 1), to_axes
 
 
 def measured_slopes(tangents: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:

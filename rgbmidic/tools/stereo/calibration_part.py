@@ -114,7 +114,6 @@ class CalibrationPart:
         turned = np.einsum("ijm,nj->nim", self.turn, deformed.points - reference.points)
         return np.asarray(np.einsum("ij,njm->nim", self.rotation, after - before) + turned)
 
-
     def mean_gain(self, points: FloatArray) -> FloatArray:
         """Return the errors (3, 3, M) of a displacement along the first index per mm along the second, over the nodes.
 
