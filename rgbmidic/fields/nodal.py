@@ -173,8 +173,7 @@ class NodalCovariance:
         """
         factor = displacement.error_factor[..., None, :]
         bias = np.zeros_like(factor)
-        if displacement.bias is not None:
-            bias[np.diag_indices(len(factor))] = np.nan_to_num(displacement.bias)[..., None, :]
+        bias[np.diag_indices(len(factor))] = np.nan_to_num(displacement.bias_std)[..., None, :]
         rows = [
             [self.errors(weights * np.sign(part), np.abs(part), shared) for part, shared in zip(*pair, strict=True)]
             for pair in zip(factor, bias, strict=True)
@@ -415,8 +414,7 @@ class RigidMotion:
         c, s = np.cos(angle), np.sin(angle)
         lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
-        bias = np.zeros_like(displacement.values) if displacement.bias is None else displacement.bias
-        terms = [*zip(displacement.uncertainty, bias, strict=True)]
+        terms = [*zip(displacement.uncertainty, displacement.bias_std, strict=True)]
         variances = [covariance.variance(equal_weights, *component) for component in terms]
         turning = sum(covariance.variance(arms, *term) for arms, term in zip(lever, terms, strict=True))
         return cls(

@@ -168,9 +168,8 @@ class ProfileLine:
                 f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
-        self.nodes, self.mesh_points = mesh_points.nearby()
+        self.nodes, self.mesh_points = nodes, _ = mesh_points.nearby()
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
-        nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
         strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
         self.covariances = {"": covariance.subset(nodes), "exx": exx, "eyy": eyy, "strain": strain_covariance}
@@ -198,9 +197,8 @@ class ProfileLine:
         near = field.isel(node=self.nodes)
         weights = self._weights(np.isfinite(near.values).tobytes())
         values = weights @ np.nan_to_num(near.values)
-        bias = 0.0 if near.bias is None else near.bias
-        std = np.sqrt(self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, bias))
-        std = np.where(np.isfinite(values), std, np.nan)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, near.bias_std)
+        std = np.where(np.isfinite(values), np.sqrt(variance), np.nan)
         return replace(field, dims=("position",), values=values, std=std, bias=None)
 
     def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
@@ -347,8 +345,8 @@ def arrival_times(
             noise = (1 - common_fraction) * weighted_std @ noise_correlation @ weighted_std
             noise += common_fraction * weighted_std.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
-    found = Field(name="arrival", dims=("position",), values=arrivals, std=errors)
-    return Arrivals(times=found, weights=sign * weights, abrupt=abrupt, cut=cut)
+    at_positions = Field(name="arrival", dims=("position",), values=arrivals, std=errors)
+    return Arrivals(times=at_positions, weights=sign * weights, abrupt=abrupt, cut=cut)
 
 
 def read_level(level: float | str) -> tuple[float, float]:

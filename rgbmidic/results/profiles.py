@@ -137,10 +137,9 @@ class Profile:
         """
         for row in rows:
             nodal = maps.read(self.field.name, int(self.frames[row]))
-            if nodal.bias is not None:
-                variances = np.square([nodal.bias, nodal.uncertainty])[:, self.line.nodes]
-                bias_variance, total_variance = np.nansum(variances, axis=1)
-                self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
+            variances = np.square([nodal.bias_std, nodal.uncertainty])[:, self.line.nodes]
+            bias_variance, total_variance = np.nansum(variances, axis=1)
+            self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
             along = self.line.read(nodal, self.covariance_key)
             self.values[row], self.std[row] = along.values, along.uncertainty
 
