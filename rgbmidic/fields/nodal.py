@@ -414,7 +414,8 @@ class RigidMotion:
         c, s = np.cos(angle), np.sin(angle)
         lever[:, is_measured] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
-        terms = [*zip(displacement.uncertainty, displacement.bias_std, strict=True)]
+        bias = np.zeros_like(displacement.values) if displacement.bias is None else displacement.bias
+        terms = [*zip(displacement.uncertainty, bias, strict=True)]
         variances = [covariance.variance(equal_weights, *component) for component in terms]
         turning = sum(covariance.variance(arms, *term) for arms, term in zip(lever, terms, strict=True))
         return cls(

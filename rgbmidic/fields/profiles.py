@@ -168,8 +168,9 @@ class ProfileLine:
                 f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
-        self.nodes, self.mesh_points = nodes, _ = mesh_points.nearby()
+        self.nodes, self.mesh_points = mesh_points.nearby()
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
+        nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
         strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
         self.covariances = {"": covariance.subset(nodes), "exx": exx, "eyy": eyy, "strain": strain_covariance}
@@ -233,19 +234,6 @@ def _unit(covariance: FloatArray) -> FloatArray:
     scale = np.sqrt(np.diag(covariance))
     scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
     return np.asarray(covariance * scale * scale[:, None])
-
-
-def rate_correlation(times: FloatArray, window: float) -> FloatArray:
-    """Compute the correlation (T, T) between frames of a rate from a parabola over a `window` of time.
-
-    That of two slopes of parabolas around their frames in independent noise, ``sum(h h') / sum(h^2)`` with h the
-    distance in time from the middle. That of `rates`, which has further degrees, is taken as the same.
-    """
-    lag = times[None] - times[:, None]
-    inside = np.abs(lag) <= 0.5 * window * (1 + 1e-6)
-    lag = np.where(inside, lag - (lag * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1)[:, None], 0.0)
-    scale = 1 / np.sqrt(np.maximum((lag**2).sum(axis=1), np.finfo(float).tiny))
-    return np.asarray((lag @ lag.T) * scale * scale[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,8 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
-from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
+from rgbmidic.fields.history import rate_correlation
+from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
