@@ -352,7 +352,7 @@ def strain_of(
     Raises
     ------
     InputError
-        The gauge is too short, or the measure unknown.
+        The gauge is too short, the measure unknown, or no uncertainty is given.
 
     Examples
     --------
@@ -363,6 +363,8 @@ def strain_of(
     >>> strain.components.round(6)[0].tolist()
     [0.01, 0.0, 0.0]
     """
+    if len(std) not in (2, 4):
+        raise InputError(f"a strain needs u_std and v_std, and may have u_bias and v_bias; {len(std)} arrays are given")
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     return StrainGauges.at_nodes(covariance, gauge).strain(Displacement.in_plane(u, v, *std), measure)
 
@@ -588,8 +590,8 @@ class StrainGauges:
         measured, count = displacement.is_measured, len(displacement.values)
         weights = self.full_weights if measured.all() else self.weights(measured)
         matrices = self.slopes if measured.all() else self._matrices(weights)
-        values, factor = (np.where(measured, array, 0.0) for array in (displacement.values, displacement.error_factor))
-        bias = np.zeros_like(values) if displacement.bias is None else np.where(measured, displacement.bias, 0.0)
+        arrays = displacement.values, displacement.bias_std, displacement.error_factor
+        values, bias, factor = (np.where(measured, array, 0.0) for array in arrays)
         gradient = np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in values], axis=1)
         spread, products = np.zeros((len(gradient), count, 2, count, 2)), weights[[0, 1, 0]] * weights[[0, 1, 1]]
         for i, j in combinations_with_replacement(range(count), 2):
