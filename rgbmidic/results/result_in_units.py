@@ -121,9 +121,8 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
-    finished = np.flatnonzero(result.finished)
-    read = [(values["time_ns"], values["number"]) for values in result.table.iterate(("time_ns", "number"), finished)]
-    stamps, numbers = np.array(read, dtype=np.int64).reshape(-1, 2).T
+    finished = result.finished
+    stamps, numbers = result.time_ns[finished], result.number[finished]
     if (stamps == UNKNOWN_TIME).any():
         recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
         rate = scale.frame_rate or recorded
