@@ -68,6 +68,11 @@ class Field:
         """The standard uncertainty as an array: NaN where there is none."""
         return np.full_like(self.values, np.nan) if self.std is None else self.std
 
+    @property
+    def bias_std(self) -> FloatArray:
+        """The `bias` as an array: 0 where there is none."""
+        return np.zeros_like(self.values) if self.bias is None else self.bias
+
     def with_arrays(self, function: Callable[..., Any], *others: Self) -> Self:
         """Return the field with a function of each of its arrays, and of the same array of other fields.
 
@@ -181,18 +186,9 @@ class Displacement(Field):
     @property
     def components(self) -> tuple[Field, ...]:
         """Each component as a field, named u, v and w."""
-        arrays = zip("uvw", self.values, self.uncertainty, strict=False)
-        return tuple(
-            Field(
-                name=name,
-                unit=self.unit,
-                dims=self.dims[1:],
-                values=values,
-                std=std,
-                bias=None if self.bias is None else self.bias[row],
-            )
-            for row, (name, values, std) in enumerate(arrays)
-        )
+        arrays = zip("uvw", self.values, self.uncertainty, self.bias_std, strict=False)
+        more: dict[str, Any] = {"unit": self.unit, "dims": self.dims[1:]}
+        return tuple(Field(name=name, values=values, std=std, bias=bias, **more) for name, values, std, bias in arrays)
 
     def smaller(self, second: Self) -> Self:
         """Return the displacement with the smaller one of the uncertainties of two, at each node.

@@ -108,8 +108,7 @@ class JumpAlong:
         previous, following = self._beside
         across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
         at_stencil = displacement.with_arrays(lambda array: array[..., self.stencil])
-        u, std = at_stencil.values, at_stencil.uncertainty
-        bias = np.zeros_like(std) if at_stencil.bias is None else at_stencil.bias
+        u, std, bias = at_stencil.values, at_stencil.uncertainty, at_stencil.bias_std
         jump, arm = u @ across, (self.points[following] - self.points[previous]).T[:, None] + u @ along
         length = np.hypot(*arm)
         tangent = arm / length

@@ -233,6 +233,19 @@ def _noise(
     return np.where(is_measured, np.maximum(noise, floor[:, None]), 0.0), fraction * min_variance
 
 
+def rate_correlation(times: FloatArray, window: float) -> FloatArray:
+    """Compute the correlation (T, T) between frames of a rate from a parabola over a `window` of time.
+
+    That of two slopes of parabolas around their frames in independent noise, ``sum(h h') / sum(h^2)`` with h the
+    distance in time from the middle. That of `rates`, which has further degrees, is taken as the same.
+    """
+    lag = times[None] - times[:, None]
+    inside = np.abs(lag) <= 0.5 * window * (1 + 1e-6)
+    lag = np.where(inside, lag - (lag * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1)[:, None], 0.0)
+    scale = 1 / np.sqrt(np.maximum((lag**2).sum(axis=1), np.finfo(float).tiny))
+    return np.asarray((lag @ lag.T) * scale * scale[:, None])
+
+
 @checked
 def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
     """Subtract from a field (H, W) its copy filtered by a Gaussian: the paper's U tilde.

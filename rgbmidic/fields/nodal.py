@@ -184,8 +184,7 @@ class NodalCovariance:
         """
         factor = displacement.error_factor[..., None, :]
         bias = np.zeros_like(factor)
-        if displacement.bias is not None:
-            bias[np.diag_indices(len(factor))] = np.nan_to_num(displacement.bias)[..., None, :]
+        bias[np.diag_indices(len(factor))] = np.nan_to_num(displacement.bias_std)[..., None, :]
         rows = [
             [self.errors(weights * np.sign(part), np.abs(part), shared) for part, shared in zip(*pair, strict=True)]
             for pair in zip(factor, bias, strict=True)

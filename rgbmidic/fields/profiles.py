@@ -205,9 +205,8 @@ class ProfileLine:
         near = field.isel(node=self.nodes)
         weights = self._weights(np.isfinite(near.values).tobytes())
         values = weights @ np.nan_to_num(near.values)
-        bias = 0.0 if near.bias is None else near.bias
-        std = np.sqrt(self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, bias))
-        std = np.where(np.isfinite(values), std, np.nan)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, near.bias_std)
+        std = np.where(np.isfinite(values), np.sqrt(variance), np.nan)
         return replace(field, dims=("position",), values=values, std=std, bias=None)
 
     def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
@@ -242,19 +241,6 @@ def _unit(covariance: FloatArray) -> FloatArray:
     scale = np.sqrt(np.diag(covariance))
     scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
     return np.asarray(covariance * scale * scale[:, None])
-
-
-def rate_correlation(times: FloatArray, window: float) -> FloatArray:
-    """Compute the correlation (T, T) between frames of a rate from a parabola over a `window` of time.
-
-    That of two slopes of parabolas around their frames in independent noise, ``sum(h h') / sum(h^2)`` with h the
-    distance in time from the middle. That of `rates`, which has further degrees, is taken as the same.
-    """
-    lag = times[None] - times[:, None]
-    inside = np.abs(lag) <= 0.5 * window * (1 + 1e-6)
-    lag = np.where(inside, lag - (lag * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1)[:, None], 0.0)
-    scale = 1 / np.sqrt(np.maximum((lag**2).sum(axis=1), np.finfo(float).tiny))
-    return np.asarray((lag @ lag.T) * scale * scale[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -354,8 +340,8 @@ def arrival_times(
             noise = (1 - common_fraction) * weighted_std @ noise_correlation @ weighted_std
             noise += common_fraction * weighted_std.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
-    found = Field(name="arrival", dims=("position",), values=arrivals, std=errors)
-    return Arrivals(times=found, weights=sign * weights, abrupt=abrupt, cut=cut)
+    at_positions = Field(name="arrival", dims=("position",), values=arrivals, std=errors)
+    return Arrivals(times=at_positions, weights=sign * weights, abrupt=abrupt, cut=cut)
 
 
 def read_level(level: float | str) -> tuple[float, float]:

@@ -569,8 +569,8 @@ class StrainGauges:
         measured, count = displacement.is_measured, len(displacement.values)
         weights = self.full_weights if measured.all() else self.weights(measured)
         matrices = self.slopes if measured.all() else self._matrices(weights)
-        values, factor = (np.where(measured, array, 0.0) for array in (displacement.values, displacement.error_factor))
-        bias = np.zeros_like(values) if displacement.bias is None else np.where(measured, displacement.bias, 0.0)
+        arrays = displacement.values, displacement.bias_std, displacement.error_factor
+        values, bias, factor = (np.where(measured, array, 0.0) for array in arrays)
         gradient = np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in values], axis=1)
         spread, products = np.zeros((len(gradient), count, 2, count, 2)), weights[[0, 1, 0]] * weights[[0, 1, 1]]
         for i, j in combinations_with_replacement(range(count), 2):

@@ -12,7 +12,8 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
-from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
+from rgbmidic.fields.history import rate_correlation
+from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
@@ -137,10 +138,9 @@ class Profile:
         """
         for row in rows:
             nodal = maps.read(self.field.name, int(self.frames[row]))
-            if nodal.bias is not None:
-                variances = np.square([nodal.bias, nodal.uncertainty])[:, self.line.nodes]
-                bias_variance, total_variance = np.nansum(variances, axis=1)
-                self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
+            variances = np.square([nodal.bias_std, nodal.uncertainty])[:, self.line.nodes]
+            bias_variance, total_variance = np.nansum(variances, axis=1)
+            self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
             along = self.line.read(nodal, self.covariance_key)
             self.values[row], self.std[row] = along.values, along.uncertainty
 

@@ -330,9 +330,8 @@ class CrackTip:
         to the least N from which all those beyond it lower no frame's chi-square by more than noise would, once in a
         thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
         """
-        std = displacement.uncertainty
-        bias = np.zeros_like(std) if displacement.bias is None else displacement.bias
-        fields = np.concatenate([displacement.values, std, bias]).swapaxes(0, 1)
+        arrays = displacement.values, displacement.uncertainty, displacement.bias_std
+        fields = np.concatenate(arrays).swapaxes(0, 1)
         is_measured: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._is_sufficient(row) for row in is_measured])
         data = {frame: _Weighted(self, fields[frame], is_measured[frame]) for frame in frames.tolist()}

@@ -7,7 +7,8 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import Displacement, Field, NodalCovariance, ProfileLine, StrainGauges
-from rgbmidic.fields.profiles import arrival_times, fit_front, rate_correlation
+from rgbmidic.fields.history import rate_correlation
+from rgbmidic.fields.profiles import arrival_times, fit_front
 from rgbmidic.mesh import Region, Tri3Mesh
 
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 490, 90), (100, 500)), 20)
