@@ -352,7 +352,7 @@ def strain_of(
     Raises
     ------
     InputError
-        The gauge is too short, or the measure unknown.
+        The gauge is too short, the measure unknown, or no uncertainty is given.
 
     Examples
     --------
@@ -363,6 +363,8 @@ def strain_of(
     >>> strain.components.round(6)[0].tolist()
     [0.01, 0.0, 0.0]
     """
+    if len(std) not in (2, 4):
+        raise InputError(f"a strain needs u_std and v_std, and may have u_bias and v_bias; {len(std)} arrays are given")
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
     return StrainGauges.at_nodes(covariance, gauge).strain(Displacement.in_plane(u, v, *std), measure)
 

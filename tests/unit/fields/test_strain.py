@@ -163,6 +163,8 @@ def test_gauges_that_are_too_short_or_outside_are_refused_in_one_line():
         StrainGauges.at_points(COVARIANCE, np.array([[300.0, 90.0]]))
     with pytest.raises(InputError, match=r'unknown strain measure "euler"; allowed are green-lagrange, hencky'):
         strain_of_gradient(np.zeros((2, 2)), np.zeros((4, 4)), "euler")
+    with pytest.raises(InputError, match=r"needs u_std and v_std, .*; 0 arrays are given"):
+        strain_of(MESH.nodes, MESH.elements, STILL, STILL)
 
 
 def test_the_settings_offer_the_measures_that_there_are():
