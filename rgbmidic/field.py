@@ -190,24 +190,24 @@ class Displacement(Field):
         more: dict[str, Any] = {"unit": self.unit, "dims": self.dims[1:]}
         return tuple(Field(name=name, values=values, std=std, bias=bias, **more) for name, values, std, bias in arrays)
 
-    def smaller(self, other: Self) -> Self:
+    def smaller(self, second: Self) -> Self:
         """Return the displacement with the smaller one of the uncertainties of two, at each node.
 
         Parameters
         ----------
-        other
+        second
             Of the same nodes.
 
         Returns
         -------
         Displacement
         """
-        flat = replace(self, covariance=None).with_arrays(np.minimum, replace(other, covariance=None))
-        flat = replace(flat, values=self.values)
-        if self.covariance is None or other.covariance is None:
-            return flat
-        traces = (np.einsum("ii...->...", matrix) for matrix in (self.covariance, other.covariance))
-        return replace(flat, covariance=np.where(np.less(*traces), self.covariance, other.covariance))
+        separate = replace(self, covariance=None).with_arrays(np.minimum, replace(second, covariance=None))
+        separate = replace(separate, values=self.values)
+        if self.covariance is None or second.covariance is None:
+            return separate
+        traces = (np.einsum("ii...->...", matrix) for matrix in (self.covariance, second.covariance))
+        return replace(separate, covariance=np.where(np.less(*traces), self.covariance, second.covariance))
 
     def since(self, base: Self, common_fraction: float) -> Self:
         """Return the displacement since another frame.
@@ -225,16 +225,16 @@ class Displacement(Field):
         """
         smaller = self.smaller(base)
 
-        def difference(now: FloatArray, before: FloatArray, shared: FloatArray) -> FloatArray:
-            return np.sqrt(np.maximum(now**2 + before**2 - 2 * common_fraction * shared**2, 0))
+        def difference(std: FloatArray, base_std: FloatArray, smaller_std: FloatArray) -> FloatArray:
+            return np.sqrt(np.maximum(std**2 + base_std**2 - 2 * common_fraction * smaller_std**2, 0))
 
-        flat, *others = (replace(one, covariance=None) for one in (self, base, smaller))
-        moved = replace(flat.with_arrays(difference, *others), values=self.values - base.values)
+        states = [replace(state, covariance=None) for state in (self, base, smaller)]
+        relative = replace(states[0].with_arrays(difference, *states[1:]), values=self.values - base.values)
         if self.covariance is None or base.covariance is None or smaller.covariance is None:
-            return moved
+            return relative
         covariance = self.covariance + base.covariance - 2 * common_fraction * smaller.covariance
         std = np.sqrt(np.maximum(np.einsum("ii...->i...", covariance), 0))
-        return replace(moved, covariance=covariance, std=std)
+        return replace(relative, covariance=covariance, std=std)
 
     @property
     def error_factor(self) -> FloatArray:

@@ -220,8 +220,7 @@ class NodalCovariance:
         NodalCovariance
         """
         fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
-        columns = (part[:, np.unique(part.indices)] for part in (fit, bias))
-        part = replace(self, **dict(zip(("fit", "bias"), columns, strict=True)))
+        part = replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
         if self.surface is not None:
             part = replace(part, surface=self.surface[nodes])
         if self.surface_covariance is not None:

@@ -297,7 +297,7 @@ class Gauge:
         nodal = self._relative.covariance
         if nodal.surface is None or nodal.surface_covariance is None or not self.moving:
             return of_probe(self.name, [extension, strain])
-        surface = Displacement(values=nodal.surface.T[:, None], covariance=nodal.surface_covariance)
+        surface = Displacement(values=nodal.surface.T, covariance=nodal.surface_covariance)
         shape = np.einsum("ta,tab,tb->t", towards, nodal.of_sums(weights, surface), towards)
         deformed = replace(extension, name="length", values=deformed_length, std=np.sqrt(std**2 + shape))
         return of_probe(self.name, [extension, strain, deformed])

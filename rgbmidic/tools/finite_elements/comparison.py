@@ -31,7 +31,7 @@ from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, rectification_of
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.tools.finite_elements.placement import Placement
-from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation
+from rgbmidic.tools.finite_elements.simulation import Levelling, Simulation, require_plane
 from rgbmidic.tools.finite_elements.simulation_nodes import COMPARED_QUANTITIES, NODE_TOLERANCE, SimulationNodes
 from rgbmidic.typing import FloatArray
 
@@ -207,11 +207,7 @@ class Comparison:
         frames: Sequence[int] | None = None,
         remove_rigid: bool = False,
     ) -> None:
-        if (components := result.in_units(scale).components) != ("u", "v"):
-            raise InputError(
-                f"{result.path} has the displacements {', '.join(components)}; a simulation is compared with u and v, "
-                "those that one camera measures in a plane: take its result"
-            )
+        require_plane(result)
         self.result, self.simulation, self.placement, self.remove_rigid = result, simulation, placement, remove_rigid
         times = frame_times(result, scale)
         self.has_times = times is not None

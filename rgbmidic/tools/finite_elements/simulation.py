@@ -255,6 +255,15 @@ def label_indices(numbers: IntArray, labels: npt.NDArray[Any]) -> IntArray:
     return np.array([positions.get(number, -1) for number in labels.tolist()], dtype=np.int64)
 
 
+def require_plane(result: Result) -> None:
+    """Refuse a result of a surface in space, which a simulation in a plane is not compared with."""
+    if (components := result.in_units().components) != ("u", "v"):
+        raise InputError(
+            f"{result.path} has the displacements {', '.join(components)}; a simulation is compared with u and v, "
+            "those that one camera measures in a plane: take its result"
+        )
+
+
 def find_placement(
     result: Result, *, scale: ScaleSettings | None = None, point_pairs: Sequence[Sequence[float]] = ()
 ) -> Placement:
@@ -272,7 +281,7 @@ def find_placement(
     Raises
     ------
     InputError
-        No points are known, or they place no mesh.
+        No points are known, or they place no mesh; or the result is of a surface in space.
 
     Examples
     --------
@@ -280,6 +289,7 @@ def find_placement(
     >>> round(placement.mm_per_pixel, 6)
     0.05
     """
+    require_plane(result)
     points, source = point_pairs, "`point_pairs`"
     if not points and (stored_placement := placement_of(result)) is not None:
         points, source = stored_placement.pairs.tolist(), "mesh.points"

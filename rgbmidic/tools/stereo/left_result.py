@@ -158,5 +158,20 @@ class LeftResult(Result):
 
 
 def open_left(path: Path | str) -> LeftResult:
-    """Open a stereo result as commands read it; errors as `StereoResult.open` and `LeftResult.of`."""
+    """Open a stereo result as histories, maps and reports read it.
+
+    Parameters
+    ----------
+    path
+        Its folder, or the HDF5 file.
+
+    Returns
+    -------
+    LeftResult
+
+    Raises
+    ------
+    ResultError
+        As of `StereoResult.open` and `LeftResult.of`.
+    """
     return LeftResult.of(StereoResult.open(path))

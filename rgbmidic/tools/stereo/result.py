@@ -126,6 +126,13 @@ class StereoResult:
         Returns
         -------
         dict of str to ndarray
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        ResultError
+            The file is damaged.
         """
         import h5py
 

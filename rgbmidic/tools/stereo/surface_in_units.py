@@ -119,9 +119,10 @@ class SurfaceInUnits(ResultInUnits):
 
     @property
     def remarks(self) -> Iterator[str]:
-        """What a reader should know of lengths, a line each."""
+        """Remarks on axes and lengths, a line each."""
         attributes = self.result.stereo.attributes
         yield f"u, v, w are along the axes {attributes['axes']}; lengths are those in space"
+        yield "places are in px of the left camera's reference; a scale in mm per px is the mean over the surface"
         yield f"the calibration leaves {100 * float(attributes['relative_length_std']):.2g} % of every length"
 
     @cached_property
