@@ -146,10 +146,10 @@ COLUMNS = ("nodes [%]", "in plane [mm]", "out of plane [mm]", "in plane: error/s
 @table("stereo", page="how-to/stereo", cost=350, keys=3, seed=0, own_quick=True)
 def stereo(quick: bool) -> Iterator[Row]:
     """Rms errors of two cameras 22° apart before a sphere turning under three lamps (448 px, .055 mm per px, elements
-    of 25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface strain
-    over 77 px, of which there is none; with all three lamps, with the red one alone in the same frames, and with white
-    lamps before monochrome cameras, three at once of a third of the power each, or one. Saturating paint is twice as glossy, exposed 1.6
-    times as long."""
+    of 25 px, Bayer frames), in the axes of the mean plane over the inner nodes: shape, displacement, and surface
+    strain over 77 px, of which there is none; with all three lamps, with the red one alone in the same frames, and
+    with white lamps before monochrome cameras, three at once of a third of the power each, or one. Saturating
+    paint is twice as glossy, exposed 1.6 times as long."""
     for paint, (gloss, exposure) in PAINTS.items():
         if quick and paint != "shiny":
             continue
