@@ -13,6 +13,7 @@ from rgbmidic import Tri3Mesh, read_frame, separate
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.results import Result
 from rgbmidic.tools.lab.virtual import Scene, State, record, render, sphere_scene, turned
 from rgbmidic.tools.lab.virtual.dataset import true_calibration, write_frame
 from rgbmidic.tools.lab.virtual.view_point import ViewPoint, true_motion, true_pair
@@ -96,31 +97,37 @@ def rows_of(scene: Scene, states: dict[str, State], folder: Path, camera: Path) 
     result = measure_stereo(*tests, camera, folder / "result", StereoSettings(gauge=GAUGE), workers=1)
     pixels = np.stack([result["x_left"], result["y_left"]], axis=1)
     inner = ~Tri3Mesh(nodes=pixels, elements=result.elements).on_boundary
+    first = Result.open(result.attributes["left"])
+    count = int((~Tri3Mesh(nodes=first.nodes, elements=first.elements).on_boundary).sum())
     turn, origin = (result.attributes[name] for name in ("axes_rotation", "axes_origin_mm"))
     left, _ = views(scene)
     rest = true_motion(scene, left, pixels, State())[0]
     yield (
-        {"state": "shape"} | figures(result, "xyz", (rest - origin) @ turn.T, inner) | epipolar(result, "common", inner)
+        {"state": "shape"}
+        | figures(result, "xyz", (rest - origin) @ turn.T, inner, count)
+        | epipolar(result, "common", inner)
     )
     for number, (name, state) in enumerate(states.items(), start=1):
         motion = true_motion(scene, left, pixels, state)[1] @ turn.T
         strain = np.stack([result[c][number] for c in ("exx", "eyy", "exy")], axis=1)
         stated = np.stack([result[f"{c}_std"][number] for c in ("exx", "eyy", "exy")], axis=1)
         usable = inner & np.isfinite(strain).all(axis=1)
-        row = figures(result, "uvw", motion, inner, number) | epipolar(result, "change", inner, number)
+        row = figures(result, "uvw", motion, inner, count, number) | epipolar(result, "change", inner, number)
         ratio = (strain / stated)[usable]
         yield {"state": name} | row | {"strain [1e-4]": 1e4 * rms(strain[usable]), "strain: error/stated": rms(ratio)}
 
 
-def figures(result: StereoResult, names: str, true: np.ndarray, inner: np.ndarray, frame: int | None = None) -> Row:
-    """Share of the nodes with data, rms errors in and out of the plane, and these over what is stated."""
+def figures(
+    result: StereoResult, names: str, true: np.ndarray, inner: np.ndarray, count: int, frame: int | None = None
+) -> Row:
+    """Nodes with data over the inner ones of the left mesh, rms errors in and out of the plane, and these over what is stated."""
     values, stds = (
         np.stack([result[f"{name}{end}"] if frame is None else result[f"{name}{end}"][frame] for name in names], axis=1)
         for end in ("", "_std")
     )
     usable = inner & np.isfinite(values).all(axis=1)
     error = values - true
-    row: Row = {"nodes [%]": 100 * float(usable.sum() / inner.sum())}
+    row: Row = {"nodes [%]": 100 * float(usable.sum() / count)}
     row |= {"in plane [mm]": rms(error[usable][:, :2]), "out of plane [mm]": rms(error[usable][:, 2])}
     ratio = error / stds
     return row | {

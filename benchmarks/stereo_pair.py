@@ -116,8 +116,8 @@ def pyvale(images: Path, folder: Path) -> None:
 
 @table("stereo_pair", page="how-to/stereo", cost=60, keys=2)
 def stereo_pair(quick: bool) -> Iterator[Row]:
-    """Two real cameras 19° apart before a D-shaped specimen that hardly moves (six frames of 1920 x 1200 px):
-    rms of what the displacement has beyond a plane, in the axes of the left camera, and what is stated of it; elements of
+    """Two real cameras 19° apart before a D-shaped specimen that hardly moves (six frames of 1920 x 1200 px): rms of
+    what the displacement has beyond a plane, in the axes of the left camera, and what is stated of it; elements of
     30 px, pyvale with subsets of 31 px at every 15th."""
     images = Path(os.environ.get("RGBMIDIC_DICE", "")) / "tests/regression/stereo_d_spec/images"
     if not (images / "GT4-0005_1.tif").is_file():
