@@ -260,6 +260,7 @@ def find_view_pairs(
         The numbers of photographs differ, or their times fit nowhere.
     """
     series = files[0].series, files[1].series
+    pairs, reasons = list[ViewPair](), list[str]()
     times = [[one.time_ns(index) for index in range(len(one))] for one in series]
     if None in times[0] or None in times[1]:
         if len(series[0]) != len(series[1]):
@@ -279,7 +280,8 @@ def find_view_pairs(
                 f"no photographs of the left and the right camera were taken at one time: the nearest are "
                 f"{1e-9 * delays.min():.3g} s apart"
             )
-    pairs, reasons = list[ViewPair](), list[str]()
+        if alone := len(nearest) - len(indices):
+            reasons.append(f"{alone} photographs of --left have none of --right that was taken at the same time")
     for numbers in indices:
         try:
             views = [
