@@ -261,7 +261,7 @@ def find_view_pairs(
     """
     series = files[0].series, files[1].series
     pairs, reasons = list[ViewPair](), list[str]()
-    times = [[one.time_ns(index) for index in range(len(one))] for one in series]
+    times = [[frames.time_ns(index) for index in range(len(frames))] for frames in series]
     if None in times[0] or None in times[1]:
         if len(series[0]) != len(series[1]):
             raise CalibrationError(
@@ -285,8 +285,8 @@ def find_view_pairs(
     for numbers in indices:
         try:
             views = [
-                _on_first_light(find_view(one.read(index)[0], target, one.name(index)), light)
-                for one, index, light in zip(series, numbers, lights, strict=True)
+                _on_first_light(find_view(frames.read(index)[0], target, frames.name(index)), light)
+                for frames, index, light in zip(series, numbers, lights, strict=True)
             ]
             pairs.append(ViewPair.of(*views))
         except CalibrationError as error:

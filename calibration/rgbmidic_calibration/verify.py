@@ -314,17 +314,17 @@ def check_stereo(
         raise CalibrationError("both cameras see the target together in no photograph")
     pair.check((views[0].left.shape, views[0].right.shape))
     points = views[0].left.points
-    stated = float(np.linalg.norm(points[:, None] - points, axis=2).max())
-    if distance is not None and not 0.9 * stated < distance < 1.1 * stated:
+    target_length = float(np.linalg.norm(points[:, None] - points, axis=2).max())
+    if distance is not None and not 0.9 * target_length < distance < 1.1 * target_length:
         raise CalibrationError(
-            f"the target's farthest points are {stated:g} mm apart as stated; a measured distance is within a tenth "
-            f"of that, not {distance:g} mm"
+            f"the target's farthest points are {target_length:g} mm apart as stated; a measured distance is within a "
+            f"tenth of that, not {distance:g} mm"
         )
     numbered = [min((view, view.renumbered), key=lambda item: item.rms(pair)) for view in views]
     figures = verdicts(pair, numbered)
-    true = distance or stated
-    error = (1 + figures["relative_length_error"]) * stated / true - 1
-    text = f"the target's farthest points are {true:g} mm apart: measured {(1 + error) * true:.6g} mm"
+    known_length = distance or target_length
+    error = (1 + figures["relative_length_error"]) * target_length / known_length - 1
+    text = f"the target's farthest points are {known_length:g} mm apart: measured {(1 + error) * known_length:.6g} mm"
     std = 100 * figures.get("relative_length_std", float("nan"))
     return [
         Check("epipolar residual", "", figures["epipolar_px"], limits.epipolar, unit="px"),

@@ -221,6 +221,11 @@ class Tri3Mesh(Derivable):
         -------
         distance : ndarray, shape (N,)
         index : ndarray, shape (N,), int64
+
+        Raises
+        ------
+        InputError
+            There are no such flags, or none of them is true.
         """
         targets = as_values(targets, "targets", (len(self.nodes),), "b")
         if not targets.any():

@@ -9,6 +9,7 @@ import pkgutil
 import re
 import textwrap
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -81,3 +82,26 @@ def test_an_exported_function_states_what_it_takes_returns_and_raises(name: str)
     gives = signature.return_annotation not in (None, "None", "NoReturn", inspect.Signature.empty)
     assert gives <= bool({"Returns", "Yields"} & stated.keys())
     assert raises(function) <= ("Raises" in stated)
+
+
+def listed(text: str) -> set[str]:
+    """Names that a section of a docstring lists."""
+    lines = re.findall(r"^(\S.*?)(?: :.*)?$", text, re.MULTILINE)
+    return {name.lstrip("*") for line in lines for name in line.split(", ")}
+
+
+def test_a_class_of_the_tools_lists_parameters_and_attributes_that_it_has() -> None:
+    roots = (Path(str(rgbmidic.__file__)).parent / "tools", Path(str(rgbmidic_calibration.__file__)).parent)
+    for path in (path for root in roots for path in root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ClassDef):
+                continue
+            parts = re.split(r"^(\w[\w ]*)\n-+$", ast.get_docstring(node) or "", flags=re.MULTILINE)
+            stated = {title: listed(text) for title, text in zip(parts[1::2], parts[2::2], strict=True)}
+            fields = {item.target.id for item in node.body if isinstance(item, ast.AnnAssign)}  # type: ignore[union-attr]
+            methods = {item.name: item for item in node.body if isinstance(item, ast.FunctionDef)}
+            owned = {item.attr for item in ast.walk(node) if isinstance(item, ast.Attribute)} | fields | methods.keys()
+            assert stated.get("Attributes", set()) <= owned, f"{path}: {node.name}"
+            if "__init__" in methods and "Parameters" in stated:
+                arguments = [item for item in ast.walk(methods["__init__"].args) if isinstance(item, ast.arg)]
+                assert stated["Parameters"] == {item.arg for item in arguments} - {"self"}, f"{path}: {node.name}"

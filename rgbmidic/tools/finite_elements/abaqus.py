@@ -59,7 +59,7 @@ def read_abaqus(path: Path) -> MeshContent:
                     "%s: rotation and translation of an *INSTANCE is not applied: nodes lie as in their part", path
                 )
         elif keyword == "NODE":
-            nodes += [(parse_whole(n), [parse_real(x) for x in (*places, "", "", "")[:3]]) for n, *places in rows]
+            nodes += [(parse_whole(n), [parse_real(x) for x in (*position, "", "", "")[:3]]) for n, *position in rows]
         elif keyword == "ELEMENT":
             shape, cells = _elements(options["TYPE"], rows)
             if shape is None:

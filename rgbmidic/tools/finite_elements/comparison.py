@@ -167,9 +167,9 @@ class Comparison:
     ----------
     frames : tuple of int
         Those that are compared.
-    left_out : tuple of int
+    frames_outside : tuple of int
         Those beyond the simulation's times.
-    timed
+    has_times
         Whether times are in seconds; else they are numbers of frames.
     relative_std
         Standard uncertainty of the scale of the image over the scale: it is one factor in all displacements.
@@ -243,7 +243,7 @@ class Comparison:
         stds = np.square([[getattr(record, name) for name in pair] for pair in names], dtype=np.float64)
         variance, bias, edge = np.einsum("nij,sjn->sin", slopes**2, [stds[0], *np.nan_to_num(stds[1:])])
         # a levelled simulation has passed through the recovery, and misses what that does
-        noise, stated_std = (np.sqrt([np.maximum(one, 0), bias]) for one in (variance - edge, variance))
+        noise, stated_std = (np.sqrt([np.maximum(total, 0), bias]) for total in (variance - edge, variance))
         simulated = self.simulation.interpolate(time)
         levelled = np.where(np.isfinite(measured), self.levelling(simulated), np.nan)
         fit, rigid, rigid_reduction = self._fit(index, measured, noise, levelled)
@@ -318,11 +318,11 @@ class Comparison:
         weighted, ratios, template, relative_bias = (
             np.where(valid, values / np.where(valid, std, 1), 0) for values in (motions, measured, levelled, bias)
         )
-        ones = np.ones(std.shape)
+        unit_std = np.ones(std.shape)
         flat = weighted.reshape(3, -1)
         inverse = np.linalg.inv(flat @ flat.T)
         measured_motion, simulated_motion = (inverse @ flat @ values.ravel() for values in (ratios, template))
-        motion_errors = self.covariance.errors(weighted, ones, relative_bias).reshape(3, -1)
+        motion_errors = self.covariance.errors(weighted, unit_std, relative_bias).reshape(3, -1)
         motion_covariance = motion_errors @ motion_errors.T
         residual, template = (
             ratios - np.tensordot(measured_motion, weighted, 1),
@@ -331,7 +331,7 @@ class Comparison:
         information, projection = float((template**2).sum()), float((template * residual).sum())
         rigid, rigid_reduction = measured_motion - simulated_motion, float(np.trace(inverse @ motion_covariance))
         scale, scale_std, scale_reduction = math.nan, math.nan, 0.0
-        errors = self.covariance.errors(template, ones, relative_bias)
+        errors = self.covariance.errors(template, unit_std, relative_bias)
         if information > _MIN_DEFORMATION * 2 * valid.sum():
             scale, energy = projection / information, float((errors**2).sum())
             scale_std = math.hypot(math.sqrt(energy) / information, scale * self.relative_std)

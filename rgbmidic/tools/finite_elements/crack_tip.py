@@ -235,8 +235,8 @@ class CrackTip:
         The nodes of the annulus in these axes from the tip, px.
     face : ndarray, shape (m,)
         1 for a node on the left side of the crack, -1 on its right side, else 0.
-    correlation : ndarray, shape (m, m)
-        Of the nodes' errors.
+    correlations : ndarray, shape (2, m, m)
+        Of the nodes' errors: those of the fit, and those that the lights' bias leaves.
     min_nodes
         Least number of nodes for the terms that are asked for.
     most_terms

@@ -53,7 +53,7 @@ class TimeHistory:
         Indices of the frames in the result.
     axis : tuple of ndarray, shape (F,), and str
         Times, or numbers of the frames where no time is known, and the label of the axis.
-    timed : bool
+    has_times : bool
         Whether the times are known.
     fields : dict
         What each quantity is.

@@ -56,18 +56,18 @@ class Canvas:
         Edges (left, top, right, bottom) of the view at first, px.
     redraw
         Called when another part, or another size, is in view.
-    like
+    neighbour
         Canvas beside it, whose part of the image it shows too.
 
     Attributes
     ----------
     plot, marks, tools
         The plot, the marks on it, and its tools: to move it, then one for each of `kinds`.
-    set
+    current_marks
         The marks as they were placed, with what was set, moved and removed on the plot since.
     window
         The part of the image in view.
-    wanted
+    requested_edges
         Edges that were asked for, before the plot's shape adds to them.
     """
 

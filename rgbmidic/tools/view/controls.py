@@ -62,7 +62,7 @@ def _group(label: str, labels: Sequence[str], active: int | None = 0) -> Control
 
 
 _NOTE = Control(bk.Div, {})
-_WRITTEN = {
+_SECTION_CHOICE = {
     "labels": list(WRITABLE_SECTIONS),
     "active": [0],
     "html_attributes": aria_group("sections that are written"),
@@ -116,7 +116,7 @@ SECTIONS: Mapping[str, Sequence[Mapping[str, Control]]] = {
         {"distance": _number("Length, mm", low=0), "distance_std": _number("± mm", low=0),
          "camera": _text("or camera")},
         {"scale_label": _NOTE}, {"file": _text("TEST.toml, beside test or result", "TEST.toml")},
-        {"sections_to_write": Control(bk.CheckboxButtonGroup, _WRITTEN)},
+        {"sections_to_write": Control(bk.CheckboxButtonGroup, _SECTION_CHOICE)},
         {"write": _button("Write"), "load_probes": _button("Take its probes")}, {"save_status": _NOTE},
     ),
 }  # fmt: skip
@@ -154,8 +154,8 @@ class ResultControls(Controls):
         flat, section_columns = {"sizing_mode": "stretch_width"}, list[Any]()
         for rows in SECTIONS.values():
             models = [[self[name] for name in controls] for controls in rows]
-            parts = [row(*group, **flat) if len(group) > 1 else group[0] for group in models]
-            section_columns.append(column(*parts, visible=not section_columns, **flat))
+            lines = [row(*group, **flat) if len(group) > 1 else group[0] for group in models]
+            section_columns.append(column(*lines, visible=not section_columns, **flat))
         self.section.js_on_change("active", script("turnTo", group=self.section, sections=section_columns))
         return column(self.description, self.section, *section_columns, self.theme, **flat)
 
@@ -167,5 +167,5 @@ class ResultControls(Controls):
         state.js_on_change("csv", script("keepCsv", state=state))
         state.js_on_change("png", script("keepPng", state=state))
         mode, scale = self["mode"], self["scale"]
-        for group, group_tools, other in ((mode, tools[:-1], scale), (scale, [tools[0], tools[-1]], mode)):
-            group.js_on_change("active", script("choose", group=group, tools=list(group_tools), other=other))
+        for group, group_tools, other_group in ((mode, tools[:-1], scale), (scale, [tools[0], tools[-1]], mode)):
+            group.js_on_change("active", script("choose", group=group, tools=list(group_tools), other=other_group))

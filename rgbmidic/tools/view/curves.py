@@ -85,9 +85,9 @@ class CurvePanel:
     ----------
     document
         Document of the page.
-    shown
+    fields
         What is in view, with its probes and channels.
-    parts
+    controls
         Controls of the page: the choice of curves and channels, and the texts on them.
 
     Attributes

@@ -143,7 +143,7 @@ class RegionDrawing:
         Plot on which they are set and drawn.
     marks
         Marks at first.
-    changed
+    on_change
         Called when they have changed.
 
     Attributes

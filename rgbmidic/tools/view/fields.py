@@ -87,7 +87,7 @@ class FieldsInView:
         Fields of the result as the view derives them.
     scale
         What replaces the ``[scale]`` of the result; None: nothing.
-    chosen
+    derivation
         How the fields are derived: what was read otherwise must be read anew.
     """
 

@@ -77,6 +77,8 @@ class LabelLayer:
         Plot on which they are drawn.
     name
         Name of their data.
+    **look
+        Properties of the points.
     """
 
     def __init__(self, canvas: Canvas, name: str, **look: Any) -> None:
@@ -213,7 +215,7 @@ class MarkLayer:
     ----------
     colours
         Colour of each probe that the marks make, by its name.
-    drawn
+    shapes
         Line (xs, ys), colour, and place (x, y) and text of each probe.
     """
 

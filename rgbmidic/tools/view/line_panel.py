@@ -36,18 +36,18 @@ class _LineReading:
 
     Parameters
     ----------
-    maps, field, place
+    maps, field, endpoints
         The result, the name of the field, and the ends of the line.
-    before
+    previous
         What was read of the result when it was shorter: it is kept unless it may differ.
 
     Attributes
     ----------
     profile
         A row of each frame of the result.
-    written : ndarray, shape (T,), int64
+    write_times : ndarray, shape (T,), int64
         When each frame was written: one that is measured again is read again.
-    read : ndarray, shape (T,), bool
+    is_read : ndarray, shape (T,), bool
         Frames that are read, or cannot be.
     clock, label
         Time of all frames, and what it is.
@@ -92,7 +92,7 @@ class LinePanel:
     ----------
     document
         Document of the page.
-    shown
+    fields
         What is in view.
     colours
         Colours of the field on the map.
@@ -103,7 +103,7 @@ class LinePanel:
     ----------
     choice, names
         Control that chooses the curves over time, or one of the lines; and their names, the first empty.
-    told
+    status
         How far the frames are read, or what went wrong.
     wave, profile
         The plots.

@@ -42,7 +42,7 @@ class MapPanel:
     ----------
     document
         Document of the visitor.
-    shown
+    fields
         The fields in view.
     dark
         Whether the page is dark.
@@ -51,7 +51,7 @@ class MapPanel:
 
     Attributes
     ----------
-    canvas, place_texts
+    canvas, side_canvases
         Canvas of the first field, on which marks are set, and those of the others.
     marks
         Marks of probes.

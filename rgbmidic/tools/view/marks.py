@@ -45,12 +45,12 @@ class UndoHistory:
 
     Parameters
     ----------
-    now
+    marks
         Marks at first.
 
     Attributes
     ----------
-    now
+    marks
         The marks.
     """
 

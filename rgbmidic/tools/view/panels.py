@@ -30,11 +30,11 @@ class ProbeNames:
 
     Parameters
     ----------
-    parts
+    controls
         Controls of the page.
-    shown
+    fields
         The fields in view, with the marks.
-    take
+    take_marks
         Called with the marks of which one has another name.
     """
 
@@ -77,9 +77,9 @@ class FileButtons:
 
     Parameters
     ----------
-    parts
+    controls
         Controls of the page.
-    shown
+    fields
         The fields in view.
     """
 
@@ -180,9 +180,9 @@ class MovieButton:
 
     Parameters
     ----------
-    parts
+    controls
         Controls of the page, with the button and what is said of the movie.
-    shown
+    fields
         The fields in view.
     """
 

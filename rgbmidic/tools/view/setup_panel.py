@@ -123,7 +123,7 @@ class SetupControls(Controls):
     ----------
     draft
         The test as far as it is known.
-    last
+    last_index
         Index of the last frame of the source.
     out
         Folder of the result.

@@ -83,12 +83,12 @@ class TimeLine:
     ----------
     frames
         Number of frames.
-    now
+    frame
         Index of the frame in view at first.
 
     Attributes
     ----------
-    plot, now
+    plot, frame_mark
         The plot, and the mark of the frame in view on it.
     """
 

@@ -110,7 +110,7 @@ class Controls:
 
     Parameters
     ----------
-    last
+    last_frame
         Index of the last frame.
     frame
         Index of the frame in view at first.
