@@ -396,10 +396,8 @@ class Tri3Mesh(Derivable):
         colour = np.empty(count, dtype=np.int64)
         colour_nodes(near.indptr, near.indices, np.zeros((count, np.diff(reach.indptr).max()), dtype=bool), colour)
         node, neighbour = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
-        slot, distance = (
-            colour[neighbour] * count + node,
-            sum((axis[node] - axis[neighbour]) ** 2 for axis in self.nodes.T),
-        )
+        slot = colour[neighbour] * count + node
+        distance = sum((axis[node] - axis[neighbour]) ** 2 for axis in self.nodes.T)
         min_distance = np.full((colour.max() + 1) * count, np.inf)
         np.minimum.at(min_distance, slot, distance)
         nearest, is_nearest = np.full(min_distance.size, count), distance == min_distance[slot]
