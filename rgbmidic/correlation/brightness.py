@@ -18,7 +18,7 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import PixelMap
-from rgbmidic.mesh.window import SlidingWindow, window_sums
+from rgbmidic.mesh.pixel_map import SlidingWindow, window_sums
 from rgbmidic.typing import FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]

@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.mesh import claim_pixels, colour_nodes
 from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, orient_elements, outline_mesh
 from rgbmidic.mesh.region import Region
-from rgbmidic.mesh.triangles import orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 

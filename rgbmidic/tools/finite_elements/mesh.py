@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.triangles import cross, orient_elements
+from rgbmidic.mesh.outline_mesh import cross, orient_elements
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
