@@ -21,7 +21,7 @@ from rgbmidic import Region, Solution, SolverSettings, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference, SolverConstants, TrackingState, track
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.start import Search
-from rgbmidic.mesh.window import SlidingWindow
+from rgbmidic.mesh.pixel_map import SlidingWindow
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import Statistics, as_weights

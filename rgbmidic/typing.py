@@ -53,6 +53,28 @@ def as_numbers(
     return array
 
 
+def as_values(values: npt.ArrayLike, name: str, shape: tuple[int | None, ...], kinds: str = "buif") -> AnyArray:
+    """Return what nodes or elements have as an array, NaN included; None in the shape is any length.
+
+    Raises
+    ------
+    InputError
+        It is of no numbers (of no flags, for `kinds` "b"), or of another shape.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of several lengths
+        array = np.empty(0, dtype=object)
+    shape_matches = array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind not in kinds or not shape_matches:
+        noun = "True or False" if kinds == "b" else "numbers"
+        size = ", ".join("any" if length is None else str(length) for length in shape)
+        raise InputError(f"{name} must be an array ({size}) of {noun}; given is {reprlib.repr(values)}")
+    return array
+
+
 def unmasked(array: npt.ArrayLike) -> AnyArray:
     """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
     if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):

@@ -30,11 +30,9 @@ def figures(
     from rgbmidic._kernels.threads import threads
     from rgbmidic.tools.report import write_figures, write_maps
 
-    frame_indices, folder, settings = (
-        command.read_frames(frames),
-        out or source.result.path / "figures",
-        source.settings,
-    )
+    frame_indices = command.read_frames(frames)
+    folder = out or source.result.path / "figures"
+    settings = source.settings
     if derived["measure"] is None and settings is not None:
         derived["measure"] = settings.probes.measure
     maps = source.maps(derived)

@@ -25,8 +25,8 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.elimination import Elimination
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.mesh import PixelMap, Tri3Mesh
+from rgbmidic.mesh.pixel_map import window_sums
 from rgbmidic.mesh.tri3 import with_data
-from rgbmidic.mesh.window import window_sums
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 

@@ -17,7 +17,7 @@ from scipy.ndimage import map_coordinates
 from rgbmidic._kernels.owned_pixels import score_sums
 from rgbmidic.correlation.assembly import block_side
 from rgbmidic.correlation.reference import Reference
-from rgbmidic.mesh.window import window_sums
+from rgbmidic.mesh.pixel_map import window_sums
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:

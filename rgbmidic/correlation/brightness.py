@@ -17,7 +17,7 @@ import numpy as np
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
 from rgbmidic.mesh import PixelMap
-from rgbmidic.mesh.window import SlidingWindow, window_sums
+from rgbmidic.mesh.pixel_map import SlidingWindow, window_sums
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]

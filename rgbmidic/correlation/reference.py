@@ -41,7 +41,7 @@ from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.window import SlidingWindow
+from rgbmidic.mesh.pixel_map import SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 

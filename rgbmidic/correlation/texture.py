@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic.mesh import PixelMap
-from rgbmidic.mesh.window import WINDOW
+from rgbmidic.mesh.pixel_map import WINDOW
 from rgbmidic.typing import FloatArray, FloatImage
 
 

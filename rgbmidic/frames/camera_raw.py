@@ -238,10 +238,9 @@ def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
         )
     if raw.num_colors == 1:
         return np.zeros((2, 2), dtype=np.intp)
-    first_row, first_column = (
-        raw.sizes.top_margin,
-        raw.sizes.left_margin,
-    )  # `raw_colors_visible` would fill the whole frame
+    # `raw_colors_visible` would fill the whole frame
+    first_row = raw.sizes.top_margin
+    first_column = raw.sizes.left_margin
     cell = np.array([[raw.raw_color(first_row + row, first_column + column) for column in (0, 1)] for row in (0, 1)])
     if pattern.shape != (2, 2) or _colour_names(raw, cell) not in BAYER_PATTERNS:
         rows, columns = pattern.shape

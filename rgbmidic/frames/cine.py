@@ -125,11 +125,9 @@ class _Header(MovieHeader):
 
     def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
         """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
-        start, n_bytes, packed_bits = (
-            int(self.pointers[index]),
-            _frame_bytes(self.shape, self.bits),
-            self.shape[1] * self.bits,
-        )
+        start = int(self.pointers[index])
+        n_bytes = _frame_bytes(self.shape, self.bits)
+        packed_bits = self.shape[1] * self.bits
         padded_bits = math.ceil(packed_bits / 32) * 32  # bits from one row to the next, as in Windows bitmaps
         is_whole = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - n_bytes)
         first_missing = int(np.argmin(np.append(is_whole, False)))

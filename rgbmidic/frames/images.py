@@ -125,10 +125,8 @@ class HeaderlessFile(FrameSource):
         return self.user_metadata.shape
 
     def _rows(self, index: int, rows: slice) -> StoredFrame:
-        shape, dtype = (
-            self._shape(),
-            np.dtype("<u2" if self.user_metadata.dtype == "uint16" else self.user_metadata.dtype),
-        )
+        shape = self._shape()
+        dtype = np.dtype("<u2" if self.user_metadata.dtype == "uint16" else self.user_metadata.dtype)
         channels, size = 3 if self.user_metadata.kind == "rgb" else 1, self.path.stat().st_size
         frame = EvenFrames(shape=shape, channels=(channels,), stored_bits=8 * dtype.itemsize, order=dtype.str[0])
         if size != frame.size:

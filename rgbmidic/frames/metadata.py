@@ -470,11 +470,9 @@ def _black_level(
 ) -> FloatArray:
     # a file's black levels differ by position, and LibRaw rounds some; less than a grey level (DN) is no contradiction
     tolerance = 1.0
-    file_level, user_level, calibrated = (
-        stored.black_level,
-        user_metadata.black_level,
-        camera.black_level if camera else None,
-    )
+    file_level = stored.black_level
+    user_level = user_metadata.black_level
+    calibrated = camera.black_level if camera else None
     if file_level is not None and user_level is not None and not (np.abs(file_level - user_level) < tolerance).all():
         raise _contradiction("black_level", (None, user_level), (path, file_level))
     if camera and calibrated is not None:
@@ -492,17 +490,13 @@ def _pattern(
     stored: StoredFrame, user_metadata: FrameSettings, path: Path, camera: CameraMetadata | None, shape: tuple[int, int]
 ) -> str:
     """Return the Bayer pattern of a mosaic of `shape`; a camera's holds where the frames begin in its own."""
-    calibrated, source, origin = (
-        camera.cfa if camera else None,
-        camera.name if camera else "",
-        user_metadata.crop_origin,
-    )
+    calibrated = camera.cfa if camera else None
+    source = camera.name if camera else ""
+    origin = user_metadata.crop_origin
     is_located = origin is not None or camera is None or camera.shape in (None, shape)
     if calibrated is not None and origin is not None:
-        calibrated, source = (
-            shift_cfa(calibrated, origin[1], origin[0]),
-            f"{source}, at frames.crop_origin = {list(origin)},",
-        )
+        calibrated = shift_cfa(calibrated, origin[1], origin[0])
+        source = f"{source}, at frames.crop_origin = {list(origin)},"
     hint = "" if is_located else "; if the camera cropped the frames, state frames.crop_origin = [x, y]"
     try:
         cfa = _common_value("cfa", [(None, user_metadata.cfa), (path, stored.cfa), (source, calibrated)])

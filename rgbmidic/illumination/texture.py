@@ -178,7 +178,6 @@ def _lanczos(fraction: FloatArray) -> FloatArray:
     return np.asarray(weights / weights.sum(axis=0))
 
 
-@lru_cache(maxsize=1)
 def lanczos_weights(steps: int = 256) -> FloatImage:
     """Return the weights (8, F) of `register_planes` of the kernels, at the middle of each of the steps."""
     return _lanczos((np.arange(steps) + 0.5) / steps).astype(np.float32)
@@ -187,6 +186,8 @@ def lanczos_weights(steps: int = 256) -> FloatImage:
 @lru_cache(maxsize=8)
 def registered_lines(widths: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Second moments of two low-passed planes along one axis, each read where it shows the texture displaced.
+
+    They take .4 s and are kept for the last eight sets of widths, 320 kB each: a test has one or two.
 
     Parameters
     ----------

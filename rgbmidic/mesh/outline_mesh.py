@@ -1,6 +1,7 @@
 """The Delaunay mesh of a region of any outline with its holes and cracks.
 
-A stated crack is a path through the region: a row of mesh nodes, along which the mesh is split.
+A stated crack is a path through the region: a row of mesh nodes, along which the mesh is split. Any mesh of triangles
+has its order of corners, its areas and the keys of its edges from here, too.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.region import MAX_COORDINATE
-from rgbmidic.mesh.triangles import cross
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0]])
@@ -303,3 +303,22 @@ def spacing_mask(points: FloatArray, distance: float) -> BoolArray:
         if keep[i]:
             keep[j] = False
     return keep
+
+
+def orient_elements(
+    points: npt.ArrayLike, elements: npt.ArrayLike, name: str
+) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
+    """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
+    nodes = np.ascontiguousarray(as_numbers(points, f"{name} has finite nodes (N, 2)", (None, 2)))
+    corners = as_numbers(elements, f"{name} has elements (E, 3), indices of nodes", (None, 3), dtype=np.int32)
+    if not len(corners) or corners.min() < 0 or corners.max() >= len(nodes):
+        raise InputError(f"{name}: elements (E, 3) must be there and name existing nodes")
+    area = cross(nodes, corners)
+    corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
+    return nodes, corners, np.abs(area)
+
+
+def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
+    """Return twice the signed area (...) of triangles (..., 3)."""
+    first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

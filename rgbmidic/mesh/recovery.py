@@ -167,10 +167,8 @@ def quadratic_fit(
         neighbours, weight, basis, structure = neighbours[:first], weight[:first], basis[:first], structure[:first]
         entries = entries[: structure.nnz]
     if information is not None:
-        node_information, neighbour_information = (
-            np.broadcast_to(information[: len(neighbours), None], neighbours.shape),
-            information[neighbours],
-        )
+        node_information = np.broadcast_to(information[: len(neighbours), None], neighbours.shape)
+        neighbour_information = information[neighbours]
         weight = weight * np.divide(
             neighbour_information,
             node_information + neighbour_information,

@@ -19,11 +19,10 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.mesh import claim_pixels, colour_nodes
 from rgbmidic.derived import Derivable
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, orient_elements, outline_mesh
 from rgbmidic.mesh.region import Region, image_shape
-from rgbmidic.mesh.triangles import as_values, orient_elements
 from rgbmidic.renamed import state_new_names
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, as_values
 
 logger = logging.getLogger(__name__)
 
@@ -410,10 +409,8 @@ class Tri3Mesh(Derivable):
         colour = np.empty(count, dtype=np.int64)
         colour_nodes(near.indptr, near.indices, np.zeros((count, np.diff(reach.indptr).max()), dtype=bool), colour)
         node, neighbour = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
-        slot, distance = (
-            colour[neighbour] * count + node,
-            sum((axis[node] - axis[neighbour]) ** 2 for axis in self.nodes.T),
-        )
+        slot = colour[neighbour] * count + node
+        distance = sum((axis[node] - axis[neighbour]) ** 2 for axis in self.nodes.T)
         min_distance = np.full((colour.max() + 1) * count, np.inf)
         np.minimum.at(min_distance, slot, distance)
         nearest, is_nearest = np.full(min_distance.size, count), distance == min_distance[slot]

@@ -262,10 +262,8 @@ def background_fraction(
     rows, columns = (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
     step = int(np.ceil(np.sqrt(len(rows) * len(columns) / 2e6)))
     window = slice(rows[0], rows[-1] + 1, step), slice(columns[0], columns[-1] + 1, step)
-    inside, box = (
-        region.mask[*window],
-        replace(images, values=images.values[:, *window], valid=images.valid[:, *window]),
-    )
+    inside = region.mask[*window]
+    box = replace(images, values=images.values[:, *window], valid=images.valid[:, *window])
     contrast = LocalContrast.of(box, [] if speckle is None else [speckle / step], inside, noise)
     return float(contrast.background(inside)[inside].mean())
 

@@ -24,7 +24,7 @@ from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.extensions import LIGHT_WEIGHTS, load_extension
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.mesh.window import WINDOW, SlidingWindow
+from rgbmidic.mesh.pixel_map import WINDOW, SlidingWindow
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage, unmasked

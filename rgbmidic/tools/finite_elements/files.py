@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.mesh.triangles import cross
+from rgbmidic.mesh.outline_mesh import cross
 from rgbmidic.settings import LENGTH_UNITS, require_regular_file
 from rgbmidic.tools.finite_elements.abaqus import read_abaqus
 from rgbmidic.tools.finite_elements.gmsh import read_gmsh

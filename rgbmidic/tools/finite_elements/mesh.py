@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.triangles import as_values, cross, orient_elements
+from rgbmidic.mesh.outline_mesh import cross, orient_elements
 from rgbmidic.renamed import state_new_names
-from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
+from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers, as_values
 
 ROUNDING = 1e-4
 """Error of a distance by rounding, as a fraction of the mesh's extent: single precision and the eight columns of

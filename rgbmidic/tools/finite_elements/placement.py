@@ -18,10 +18,9 @@ from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.source import Plane
-from rgbmidic.mesh.triangles import as_values
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
-from rgbmidic.typing import FloatArray, as_numbers
+from rgbmidic.typing import FloatArray, as_numbers, as_values
 
 logger = logging.getLogger(__name__)
 
