@@ -60,7 +60,7 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-RENDERER = ("lab/virtual", "scene", "kernels")
+RENDERER = ("lab/virtual", "kernels")
 """Rooms whose tests are about the renderer."""
 
 

@@ -18,40 +18,19 @@ import draws
 import numpy as np
 
 from rgbmidic.tools.lab.virtual import rendering
+from rgbmidic.tools.scene import speckle, surface
 
 _VARIABLE = "RGBMIDIC_RENDERS"
 _WORTH = 0.1
 """Seconds of the processor from which a render is kept: to read it takes a hundredth."""
-_trace = rendering._trace
+_RENDERER = [(rendering, "_trace"), (surface.Surface, "on_plate"), (speckle, "cover_covariance")]
+"""What renders a scene, and what a forecast asks of its paint."""
+_NEW = [getattr(*place) for place in _RENDERER]
 
 
 def renders() -> Path:
     """Folder of what the processes of this run have in common."""
     return Path(os.environ[_VARIABLE])
-
-
-@contextmanager
-def kept_renders() -> Iterator[None]:
-    """Keep renders within the block, in the folder of the process that started this one or else in one that ends."""
-    with tempfile.TemporaryDirectory(prefix="rgbmidic-renders-") as folder:
-        first = os.environ.setdefault(_VARIABLE, folder) == folder
-        before, rendering._trace = rendering._trace, _found
-        try:
-            yield
-        finally:
-            rendering._trace = before
-            if first:
-                del os.environ[_VARIABLE]
-
-
-@contextmanager
-def new_renders() -> Iterator[None]:
-    """Render anew within the block, which is about the renderer."""
-    before, rendering._trace = rendering._trace, _trace
-    try:
-        yield
-    finally:
-        rendering._trace = before
 
 
 def kept(make: Callable[..., Any]) -> Callable[..., Any]:
@@ -70,16 +49,48 @@ def kept(make: Callable[..., Any]) -> Callable[..., Any]:
     return found
 
 
+@contextmanager
+def kept_renders() -> Iterator[None]:
+    """Keep renders within the block, in the folder of the process that started this one or else in one that ends."""
+    with tempfile.TemporaryDirectory(prefix="rgbmidic-renders-") as folder:
+        first = os.environ.setdefault(_VARIABLE, folder) == folder
+        try:
+            with _exchanged([_found, *map(kept, _NEW[1:])]):
+                yield
+        finally:
+            if first:
+                del os.environ[_VARIABLE]
+
+
+@contextmanager
+def new_renders() -> Iterator[None]:
+    """Render anew within the block, which is about the renderer."""
+    with _exchanged(_NEW):
+        yield
+
+
+@contextmanager
+def _exchanged(functions: list[Callable[..., Any]]) -> Iterator[None]:
+    before = [getattr(*place) for place in _RENDERER]
+    for place, function in zip(_RENDERER, functions, strict=True):
+        setattr(*place, function)
+    try:
+        yield
+    finally:
+        for place, function in zip(_RENDERER, before, strict=True):
+            setattr(*place, function)
+
+
 def _found(*scene_and_state: Any) -> Any:
     try:
         described = pickle.dumps(scene_and_state)
     except (pickle.PicklingError, AttributeError, TypeError):  # displaced by a function that has no name
-        return _trace(*scene_and_state)
+        return _NEW[0](*scene_and_state)
     path = renders() / f"{hashlib.sha1(described).hexdigest()}.npy"
     if path.exists():
         return np.load(path)
     start = time.process_time()
-    images = _trace(*scene_and_state)
+    images = _NEW[0](*scene_and_state)
     if time.process_time() - start > _WORTH:
         temporary = path.with_suffix(f".{os.getpid()}.npy")
         np.save(temporary, images)

@@ -8,6 +8,7 @@ import renders
 from draws import other_draws
 
 from rgbmidic.tools.lab.virtual import Scene, plate_scene, record, render, turned
+from rgbmidic.tools.scene import speckle
 
 LEVEL = 400.0
 
@@ -55,7 +56,7 @@ def test_a_render_is_made_once_unless_it_is_to_be_made_anew(monkeypatch, tmp_pat
         made.append(state)
         return np.ones((3, 2, 2), np.float32)
 
-    monkeypatch.setattr(renders, "_trace", trace)
+    monkeypatch.setattr(renders, "_NEW", [trace, *renders._NEW[1:]])
     monkeypatch.setattr(renders, "_WORTH", -1.0)
     monkeypatch.setenv("RGBMIDIC_RENDERS", str(tmp_path))
     scene = plate_scene(size=2)
@@ -65,4 +66,9 @@ def test_a_render_is_made_once_unless_it_is_to_be_made_anew(monkeypatch, tmp_pat
         assert len(made) == 2
         with renders.new_renders():
             render(scene, turned(1.25))
+            assert speckle.cover_covariance is renders._NEW[2]
         assert len(made) == 3
+        told = [speckle.cover_covariance(scene.surface, np.linspace(0, distance, 9)) for distance in (0.1, 0.2, 0.1)]
+    np.testing.assert_array_equal(told[0], told[2])
+    np.testing.assert_array_equal(told[1], renders._NEW[2](scene.surface, np.linspace(0, 0.2, 9)))
+    assert len(list(tmp_path.glob("*.pickle"))) == 2

@@ -501,6 +501,7 @@ def test_files_are_written_and_nothing_is_overwritten(tmp_path):
         write_inspection(mat(), out)
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_command(command: Run, tmp_path: Path) -> None:
     test = colour_test(tmp_path / "test", [(0.0, 0.0)])
     out = tmp_path / "out"

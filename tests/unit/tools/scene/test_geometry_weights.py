@@ -34,14 +34,8 @@ ONES = np.ones((3, *SHAPE), dtype=np.float32)
 IMAGES = IlluminationImages(values=ONES, valid=ONES > 0, names=LIGHTS, full_scale=1.0)
 
 
-@pytest.fixture(scope="module")
-def prepared():
-    """Weights that tests have in common, by what they were prepared from."""
-    return {}
-
-
 @pytest.fixture
-def prepare(tmp_path: Path, prepared):
+def prepare(tmp_path: Path):
     """Weights from a scene text, settings of ``[weights]`` and what the test is like."""
 
     def run(scene=SCENE + STATES, *, lights=LIGHTS, shape=SHAPE, frames=3, reference=0, **weights):
@@ -52,10 +46,7 @@ def prepare(tmp_path: Path, prepared):
             "weights": {"method": "geometry", "geometry": "scene.toml", **weights},
         }
         settings = TestSettings.from_mapping(document, tmp_path)
-        key = repr((scene, lights, shape, frames, reference, weights))
-        if key not in prepared:
-            prepared[key] = GeometryWeights.prepare(settings, lights=lights, shape=shape, frames=frames)
-        return prepared[key]
+        return GeometryWeights.prepare(settings, lights=lights, shape=shape, frames=frames)
 
     return run
 

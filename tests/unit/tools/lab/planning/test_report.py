@@ -102,6 +102,7 @@ def test_nothing_is_overwritten_unless_asked(made, tmp_path):
         write_plan(plan, {}, tmp_path / "file")
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_the_command_prints_the_tables_and_writes_the_files(made, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     scene, plan, _ = made
     assert execute(cli.app, ["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 0
