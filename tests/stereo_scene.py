@@ -95,9 +95,6 @@ def write_tests(folder: Path, pair: CameraPair, motions=MOTIONS, sigma: float = 
     return tests[0], tests[1], folder / "stereo.json"
 
 
-BOARD = "chessboard:6x5:3mm"
-
-
 def photograph(pair: CameraPair, side: int, rotation, translation):
     """Photograph (H, W) of a chessboard of 6 x 5 inner corners, 3 mm apart, with edges blurred by .9 px."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
