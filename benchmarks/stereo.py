@@ -120,7 +120,7 @@ def rows_of(scene: Scene, states: dict[str, State], folder: Path, camera: Path) 
 def figures(
     result: StereoResult, names: str, true: np.ndarray, inner: np.ndarray, count: int, frame: int | None = None
 ) -> Row:
-    """Nodes with data over the inner ones of the left mesh, rms errors in and out of the plane, over what is stated."""
+    """Nodes with data over the left mesh's inner ones, rms errors in and out of the plane, and over what is stated."""
     values, stds = (
         np.stack([result[f"{name}{end}"] if frame is None else result[f"{name}{end}"][frame] for name in names], axis=1)
         for end in ("", "_std")
