@@ -554,7 +554,7 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         page.driver.execute_script(*click("Movie"))
         page.until("model('movie_status').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
         page.until(
-            f"model('movie_status').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60
+            f"model('movie_status').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=180
         )
         assert not page.run("model('movie').active")
         maps = Maps.from_result(wave, gauge=60.0, since=1, measure="hencky")
@@ -563,16 +563,16 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         before = first.read_bytes()
         assert before == (tmp_path / "a.gif").read_bytes()
         page.keys("m")
-        page.until(f"model('movie_status').text.startsWith('written: {second}')", patience=60)
+        page.until(f"model('movie_status').text.startsWith('written: {second}')", patience=180)
         assert first.read_bytes() == before
         monkeypatch.undo()
         if there:
             page.keys("m")
-            page.until(f"model('movie_status').text === 'written: {other}'", patience=60)
+            page.until(f"model('movie_status').text === 'written: {other}'", patience=180)
         page.do("model('quantity').value = 'node_status'")
         page.keys("m")
         page.until(
-            "model('movie_status').text.includes('a movie shows fields of numbers, not node_status')", patience=60
+            "model('movie_status').text.includes('a movie shows fields of numbers, not node_status')", patience=180
         )
         page.until("!model('movie').active")  # which is told after the text
         page.do("model('quantity').value = 'v'")

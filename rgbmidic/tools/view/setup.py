@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
-from bokeh.layouts import column
 from bokeh.models import ColumnDataSource
 
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -85,44 +84,38 @@ class SetupPage:
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
         controls = self.controls
-        side_column = column(
-            controls.message,
-            controls.file,
-            controls.write,
-            controls.out,
-            controls.run_button,
-            controls.run_status,
-            controls.tiles,
-            sizing_mode="stretch_width",
-        )
         return {
             "head": controls.head,
-            "side": controls.side,
+            "side": controls.left,
             "plot": self.canvas.plot,
-            "curves": side_column,
+            "curves": controls.right,
             "player": controls.player,
         }
 
     def _listen(self) -> None:
         controls, tools = self.controls, list(self.canvas.tools)
-        for model, key in ((self.state, "requested_frame"), (controls.picture, "value"), (controls.glare, "active")):
+        for model, key in (
+            (self.state, "requested_frame"),
+            (controls["picture"], "value"),
+            (controls["glare"], "active"),
+        ):
             model.on_change(key, lambda attr, old, new: self.update_picture())
-        controls.size.on_change("value", lambda attr, old, new: self._remesh())
-        controls.light.on_change("value", lambda attr, old, new: self._choose_light())
-        controls.calibration.on_change("value", lambda attr, old, new: self._run_guarded(self._reopen))
+        controls["size"].on_change("value", lambda attr, old, new: self._remesh())
+        controls["light"].on_change("value", lambda attr, old, new: self._choose_light())
+        controls["calibration"].on_change("value", lambda attr, old, new: self._run_guarded(self._reopen))
         for button, action in (
-            (controls.undo, partial(self.drawing.step, back=True)),
-            (controls.redo, partial(self.drawing.step, back=False)),
-            (controls.next_shape, self.drawing.next_hole), (controls.clear, partial(self.drawing.take_marks, ())),
-            (controls.inspect, self._inspect), (controls.write, self._write), (controls.run_button, self._run),
+            (controls["undo"], partial(self.drawing.step, back=True)),
+            (controls["redo"], partial(self.drawing.step, back=False)),
+            (controls["next"], self.drawing.next_hole), (controls["clear"], partial(self.drawing.take_marks, ())),
+            (controls["inspect"], self._inspect), (controls["write"], self._write), (controls["run"], self._run),
         ):  # fmt: skip
             button.on_click(partial(self._run_guarded, action))
         controls.request_frames(self.state)
-        controls.mode.js_on_change(
-            "active", script("choose", group=controls.mode, tools=tools[:4], other=controls.hole)
+        controls["mode"].js_on_change(
+            "active", script("choose", group=controls["mode"], tools=tools[:4], other=controls["hole"])
         )
-        controls.hole.js_on_change(
-            "active", script("choose", group=controls.hole, tools=tools[4:], other=controls.mode)
+        controls["hole"].js_on_change(
+            "active", script("choose", group=controls["hole"], tools=tools[4:], other=controls["mode"])
         )
         self.document.on_event(DocumentReady, lambda event: self._start())
         call_periodically(VIEWER.run_ms, self.document, self._tick, self._report)
@@ -148,14 +141,14 @@ class SetupPage:
         name = html.escape(self.source.series.name(index))
         self.controls.description.text = f"Frame {index} of 0 to {len(self.source.series) - 1}: {name}"
         raw, is_saturated = self.source.read_picture(index)
-        picture_name = self.controls.picture.value
+        picture_name = self.controls["picture"].value
         picture = self.pictures.get(picture_name, raw)
         overlay, window = (
             self._expected if picture_name == _EXPECTED else None,
             self.canvas.window.limited(VIEWER.picture_pixels),
         )
         image = paint(window, picture, overlay, OUTSIDE_GREY[self.dark])
-        if self.controls.glare.active:
+        if self.controls["glare"].active:
             saturated = paint(window, is_saturated.astype(np.uint8) * 255, outside_grey=0)
             image = np.where((saturated & 0xFF) > 64, _GLARE, image)
         self.canvas.show_picture(image)
@@ -172,8 +165,8 @@ class SetupPage:
         self._reader.cancel()
         if self._expected is not None:
             self._expected, self.pictures = None, {}
-            self.controls.tiles.text = ""
-            self.controls.picture.value, self.controls.picture.options = RAW, [RAW]
+            self.controls["tiles"].text = ""
+            self.controls["picture"].value, self.controls["picture"].options = RAW, [RAW]
         self._edges.data = {"xs": [], "ys": []}
         self._run_guarded(self._make_mesh)
 
@@ -192,7 +185,7 @@ class SetupPage:
 
         None where there is neither a file nor a region with an element size.
         """
-        content, size = region_of(self.drawing.marks), self.controls.size.value
+        content, size = region_of(self.drawing.marks), self.controls["size"].value
         if self.draft.section("mesh").get("file"):
             document = {**self.draft.document, "region": content or self.draft.section("region")}
             settings = TestSettings.from_mapping(document, self.draft.file.parent)
@@ -219,8 +212,8 @@ class SetupPage:
     def _receive(self, read_inspection: Callable[[], Inspection], index: int) -> None:
         inspection, self._inspected = read_inspection(), index
         self.pictures = pictures(inspection, self.source.shape)
-        self.controls.tiles.text = overview(inspection, self.pictures, self.source.read_picture(index)[0])
-        self.controls.picture.options = [RAW, *self.pictures, _EXPECTED]
+        self.controls["tiles"].text = overview(inspection, self.pictures, self.source.read_picture(index)[0])
+        self.controls["picture"].options = [RAW, *self.pictures, _EXPECTED]
         finite = inspection.prediction.std[np.isfinite(inspection.prediction.std)]
         mesh: dict[str, Any] = {"nodes": inspection.mesh.nodes, "elements": inspection.mesh.elements}
         look: dict[str, Any] = {"colour_range": colour_range(finite) if finite.size else (0.0, 1.0), "opacity": 0.8}
@@ -230,24 +223,24 @@ class SetupPage:
         self.controls.message.text = "<br>".join(
             lines + [f"• {html.escape(finding.text)}" for finding in inspection.findings]
         )
-        if self.controls.picture.value == _EXPECTED:
+        if self.controls["picture"].value == _EXPECTED:
             self.update_picture()
         else:  # which shows it
-            self.controls.picture.value = _EXPECTED
+            self.controls["picture"].value = _EXPECTED
 
     def _edited_draft(self) -> Draft:
         """Return the draft with the values of all controls."""
         controls, last_frame = self.controls, len(self.source.series) - 1
-        frames: dict[str, Any] = {"first": int(controls.first_frame.value) or None}
-        frames["last"] = None if int(controls.last_frame.value) == last_frame else int(controls.last_frame.value)
-        if int(controls.reference.value) != self.draft.frames.reference[0]:
-            frames["reference"] = [int(controls.reference.value)]
+        frames: dict[str, Any] = {"first": int(controls["first"].value) or None}
+        frames["last"] = None if int(controls["last"].value) == last_frame else int(controls["last"].value)
+        if int(controls["reference"].value) != self.draft.frames.reference[0]:
+            frames["reference"] = [int(controls["reference"].value)]
         changes: dict[str, dict[str, Any]] = {"frames": frames}
-        mesh, size = self.draft.section("mesh"), float(controls.size.value)
+        mesh, size = self.draft.section("mesh"), float(controls["size"].value)
         if not mesh.get("file") and not (mesh.get("element_size") == "auto" and size == ELEMENT_SIZE):
             changes["mesh"] = {"element_size": size}
-        if controls.calibration.value:
-            changes["calibration"] = {"file": controls.calibration.value}
+        if controls["calibration"].value:
+            changes["calibration"] = {"file": controls["calibration"].value}
         if region := region_section(self.draft.section("region"), self.drawing.marks):
             changes["region"] = region
         return self.draft.with_values(changes)
@@ -264,13 +257,13 @@ class SetupPage:
 
     def _offer_lights(self) -> None:
         """Offer the lights for masks."""
-        self.controls.light.options = list(self.source.lights)
-        self.controls.light.value = next(iter(self.source.lights), "")
+        self.controls["light"].options = list(self.source.lights)
+        self.controls["light"].value = next(iter(self.source.lights), "")
         self._choose_light()
 
     def _choose_light(self) -> None:
         """Let masks that are drawn from now on be of the light chosen, each of its own."""
-        self.drawing.light = self.controls.light.value
+        self.drawing.light = self.controls["light"].value
         self.drawing.next_hole()
 
     def _write(self) -> bool:
@@ -278,7 +271,7 @@ class SetupPage:
         self.drawing.settle()  # else it takes the place of what is reported here
         check_complete(self.drawing.marks)
         self._reopen()
-        draft = self.draft.with_path(Path(self.controls.file.value))
+        draft = self.draft.with_path(Path(self.controls["file"].value))
         draft, pictures = draft.with_masks(self.drawing.marks, self.source.lights, self.source.shape)
         draft.check()
         is_same_file = draft.file == self._stored_draft.file
@@ -304,8 +297,8 @@ class SetupPage:
         if self.runs and self.runs[-1].is_running:
             self.controls.message.text = "The run still goes on."
         elif self._write():
-            self.runs.append(Run(self.draft.file, Path(self.controls.out.value)))
+            self.runs.append(Run(self.draft.file, Path(self.controls["out"].value)))
 
     def _tick(self) -> None:
         if self.runs:
-            self.controls.run_status.text = self.runs[-1].text()
+            self.controls["ran"].text = self.runs[-1].text()

@@ -7,17 +7,15 @@ import html
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import bokeh.models as bk
 import cv2
 import numpy as np
 import numpy.typing as npt
-from bokeh.layouts import column, row
+from bokeh.layouts import column
 
 from rgbmidic.errors import ResultError
 from rgbmidic.frames.series import open_series
@@ -31,7 +29,7 @@ from rgbmidic.tools.report.painter import Picture
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.picture import grey_picture, stretch_to_uint8
 from rgbmidic.tools.view.test_file_editor import Draft
-from rgbmidic.tools.view.widgets import Controls
+from rgbmidic.tools.view.widgets import NOTE, Control, Controls, button, check, choice, count, group, text
 
 RAW = "raw frame"
 
@@ -116,6 +114,22 @@ def overview(inspection: Inspection, pictures_by_name: Mapping[str, Picture], ra
     return render("tiles.html", Path(__file__).parent, across=1 + len(inspection.images.names), tiles=tiles)
 
 
+_LEFT: Sequence[Mapping[str, Control]] = (
+    {"picture": choice("Picture", [RAW])}, {"glare": check("mark saturated samples", active=True)},
+    {"mode": group("shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])},
+    {"hole": group("what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)},
+    {"undo": button("Undo"), "redo": button("Redo"), "next": button("Next"), "clear": button("Clear")},
+    {"light": choice("Masks are of"), "size": count("Element size (px)", low=4)},
+    {"reference": count("Reference", low=0), "first": count("First", low=0), "last": count("Last", low=0)},
+    {"calibration": text("Calibration file")}, {"inspect": button("Inspect")},
+)  # fmt: skip
+_RIGHT: Sequence[Mapping[str, Control]] = (
+    {"message": NOTE}, {"file": text("Write to")}, {"write": button("Write TEST.toml")}, {"out": text("Result folder")},
+    {"run": button("Run", button_type="primary")}, {"ran": NOTE}, {"tiles": NOTE},
+)  # fmt: skip
+"""Controls left and right of the frame, in rows."""
+
+
 class SetupControls(Controls):
     """Controls of the page that sets a test up.
 
@@ -132,52 +146,34 @@ class SetupControls(Controls):
 
     Attributes
     ----------
-    side
-        The column left of the frame.
+    left, right
+        The columns beside the frame.
     """
 
     def __init__(self, draft: Draft, last_index: int, out: Path, *, dark: bool) -> None:
-        frames = draft.frames
-        super().__init__(last_index, frames.reference[0], dark=dark)
-        wide, size = self.wide, draft.section("mesh").get("element_size", "auto")
-        size = ELEMENT_SIZE if size == "auto" else size
+        frames, size = draft.frames, draft.section("mesh").get("element_size", "auto")
+        super().__init__([*_LEFT, *_RIGHT], last_index, frames.reference[0], dark=dark)
         self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
-        self.picture = bk.Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide)
-        self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
-        self.mode = self.group("mode", "shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])
-        self.hole = self.group("hole", "what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)
-        labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
-        self.undo, self.redo, self.next_shape, self.clear, self.inspect, self.write = (
-            bk.Button(label=name, name=name.lower(), **wide) for name in labels
-        )
-        self.light = bk.Select(title="Masks are of", name="light", **wide)
-        self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
         final_frame = last_index if frames.last is None else frames.last
-        frame_values = {"Reference": frames.reference[0], "First": frames.first, "Last": final_frame}
-        self.reference, self.first_frame, self.last_frame = (
-            bk.Spinner(title=title, name=title.lower(), value=number, low=0, high=last_index, step=1, **wide)
-            for title, number in frame_values.items()
-        )
-        if (count := len(frames.reference)) > 1:  # the control has the first of them; another value is one frame
+        for name, value in {
+            "size": ELEMENT_SIZE if size == "auto" else size, "reference": frames.reference[0],
+            "first": frames.first, "last": final_frame, "file": str(draft.file), "out": str(out),
+            "calibration": str(draft.section("calibration").get("file", "")),
+        }.items():  # fmt: skip
+            self[name].value = value
+        for name in ("reference", "first", "last"):
+            self[name].high = last_index
+        if (n_frames := len(frames.reference)) > 1:  # the control has the first of them; another value is one frame
 
             def update_title(_name: str, _old: object, number: float) -> None:
-                self.reference.title = f"Reference, {count} from" if number == frames.reference[0] else "Reference"
+                is_stated = number == frames.reference[0]
+                self["reference"].title = f"Reference, {n_frames} from" if is_stated else "Reference"
 
-            self.reference.on_change("value", update_title)
+            self["reference"].on_change("value", update_title)
             update_title("value", None, frames.reference[0])
-        calibration = str(draft.section("calibration").get("file", ""))
-        texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
-        self.calibration, self.file, self.out = (
-            bk.TextInput(title=title, name=name, value=text, **wide)
-            for name, (title, text) in zip(("calibration", "file", "out"), texts.items(), strict=True)
-        )
-        self.run_button = bk.Button(label="Run", button_type="primary", **wide)
-        self.run_status, self.tiles = bk.Div(name="ran", **wide), bk.Div(name="tiles", **wide)
-        line = partial(row, sizing_mode="stretch_width")
-        buttons = line(self.undo, self.redo, self.next_shape, self.clear)
-        sizes, numbers = line(self.light, self.size), line(self.reference, self.first_frame, self.last_frame)
-        widgets = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
-        self.side = column(*widgets, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
+        flat = {"sizing_mode": "stretch_width"}
+        self.left = column(self.description, *self.lines(_LEFT), self.theme, **flat)
+        self.right = column(*self.lines(_RIGHT), **flat)
 
 
 class Run:

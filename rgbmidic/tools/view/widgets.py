@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import html
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, TypeVar
 
@@ -105,11 +106,61 @@ class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml
     png = String("")
 
 
+@dataclass(frozen=True, slots=True)
+class Control:
+    """A control: its kind of widget, and the properties of that, which limit the value of an entry of the view."""
+
+    widget: type[bk.UIElement]
+    options: Mapping[str, Any]
+
+
+def choice(title: str, options: Iterable[Any] | None = None) -> Control:
+    """Return a list of which one is chosen."""
+    return Control(bk.Select, {"title": title, **({} if options is None else {"options": list(options)})})
+
+
+def number(title: str, **limits: float) -> Control:
+    """Return the field of a real number."""
+    return Control(bk.NumericInput, {"title": title, "mode": "float", **limits})
+
+
+def count(title: str, **limits: int) -> Control:
+    """Return the field of a whole number."""
+    return Control(bk.Spinner, {"title": title, **limits})
+
+
+def check(label: str, *, active: bool = False) -> Control:
+    """Return a box that is checked or not."""
+    return Control(bk.Checkbox, {"label": label, "active": active})
+
+
+def text(title: str, value: str = "") -> Control:
+    """Return the field of a text."""
+    return Control(bk.TextInput, {"title": title, "value": value})
+
+
+def button(label: str, **look: str) -> Control:
+    """Return a button."""
+    return Control(bk.Button, {"label": label, **look})
+
+
+def group(label: str, labels: Iterable[str], active: int | None = 0) -> Control:
+    """Return buttons of which one is pressed, with a label for screen readers."""
+    look = {"labels": list(labels), "html_attributes": aria_group(label)}
+    return Control(bk.RadioButtonGroup, {**look, "active": active})
+
+
+NOTE = Control(bk.Div, {})
+"""A text that the page sets."""
+
+
 class Controls:
-    """Controls that every page has: texts, theme, and the player of the frames.
+    """Controls of a page: by their names those of a table, and what every page has: texts, theme, player of frames.
 
     Parameters
     ----------
+    table
+        Controls of the page, in rows.
     last_frame
         Index of the last frame.
     frame
@@ -125,12 +176,16 @@ class Controls:
         The row of play button, step and slider.
     """
 
-    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
+    def __init__(self, table: Iterable[Mapping[str, Control]], last_frame: int, frame: int, *, dark: bool) -> None:
         styles = ("widgets.css", "dark.css") if dark else ("widgets.css",)
         self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=page_file(name)) for name in styles]}
         self.wide = wide = {**self.small, "sizing_mode": "stretch_width"}
         other_theme, max_frame = "light" if dark else "dark", max(last_frame, 1)
-        self.head, self.message = bk.Div(**wide), bk.Div(name="message", **wide)
+        self._models: dict[str, Any] = {}
+        for name, control in (item for controls in table for item in controls.items()):
+            look = self.small if control.widget is bk.Checkbox else wide
+            self._models[name] = control.widget(name={"field": "quantity"}.get(name, name), **control.options, **look)
+        self.head, self.message = bk.Div(**wide), self["message"]
         self.description = bk.Div(name="description", html_attributes=LIVE_REGION, **wide)
         self.theme = bk.Button(label=f"{other_theme.capitalize()} page", **wide)
         self.theme.js_on_click(script("turn", theme=other_theme))
@@ -144,10 +199,14 @@ class Controls:
         )
         self.player = row(self.play, self.step, self.frame, sizing_mode="stretch_width")
 
-    def group(self, name: str, label: str, labels: Iterable[str], active: int | None = 0) -> Any:
-        """Make buttons of which one is pressed, with a label for screen readers."""
-        look = {"html_attributes": aria_group(label), **self.wide}
-        return bk.RadioButtonGroup(labels=list(labels), active=active, name=name, **look)
+    def __getitem__(self, name: str) -> Any:
+        """Return the widget of a control."""
+        return self._models[name]
+
+    def lines(self, table: Iterable[Mapping[str, Control]]) -> list[Any]:
+        """Return the widgets of rows of controls, one below the other."""
+        rows = [[self[name] for name in controls] for controls in table]
+        return [row(*models, sizing_mode="stretch_width") if len(models) > 1 else models[0] for models in rows]
 
     def request_frames(self, state: SharedState) -> None:
         """Let the slider ask for frames, and play them."""

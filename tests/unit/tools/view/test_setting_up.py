@@ -60,9 +60,9 @@ def test_a_size_that_the_run_finds_is_kept_unless_it_is_changed(tmp_path):
     controls = SetupControls(Draft.from_path(file), 4, tmp_path / "out", dark=False)
     page = SimpleNamespace(controls=controls, draft=Draft.from_path(file), drawing=SimpleNamespace(marks=[]))
     page.source = SimpleNamespace(series=range(5))
-    assert controls.size.value == 25
+    assert controls["size"].value == 25
     assert SetupPage._edited_draft(page).section("mesh")["element_size"] == "auto"
-    controls.size.value = 30
+    controls["size"].value = 30
     assert SetupPage._edited_draft(page).section("mesh")["element_size"] == 30
 
 
@@ -72,10 +72,10 @@ def test_a_reference_of_several_frames_is_stated_and_kept_unless_it_is_changed(t
     controls = SetupControls(Draft.from_path(file), 4, tmp_path / "out", dark=False)
     page = SimpleNamespace(controls=controls, draft=Draft.from_path(file), drawing=SimpleNamespace(marks=[]))
     page.source = SimpleNamespace(series=range(5))
-    assert (controls.reference.title, controls.reference.value) == ("Reference, 3 from", 1)
+    assert (controls["reference"].title, controls["reference"].value) == ("Reference, 3 from", 1)
     assert SetupPage._edited_draft(page).frames.reference == (1, 2, 3)
-    controls.reference.value = 2
-    assert controls.reference.title == "Reference"
+    controls["reference"].value = 2
+    assert controls["reference"].title == "Reference"
     assert SetupPage._edited_draft(page).frames.reference == (2,)
 
 
