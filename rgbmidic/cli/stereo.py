@@ -68,7 +68,7 @@ def stereo(
                 measure_stereo_part(
                     left, right, camera, out, part, settings, workers=workers or None, progress=progress
                 )
-                print(f"frames {frames} are measured; when all frames are: --resume instead")
+                print(f"frames {frames} are measured; when all are, --resume in place of --frames triangulates them")
                 return
             result = measure_stereo(
                 left,

@@ -108,7 +108,7 @@ class _Tensors:
         with np.errstate(divide="ignore", invalid="ignore"):
             first = np.einsum("na,nab,nb->n", slope, covariance, slope) / np.where(square > 0, square, np.inf)
             large = square / (square + noise)
-        return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)
+            return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)
 
 
 def _entry(name: str, symbol: str, description: str, **more: Any) -> ResultQuantity:
