@@ -35,15 +35,15 @@ VARIED = {
         *("min_initial_zncc", "max_oscillating_fraction"),
     ),
     "window": ("sigma",),
-    "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
-    "statistics": ("freedom", "least_variance", "independent_fraction"),
+    "search": ("normalise", "flat", "voters", "context"),
+    "statistics": ("freedom", "independent_fraction"),
 }
 """Constants of each part of the method."""
 QUICK = ("sigma",)
 """Of `--quick`: the window of all sums over blocks."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
-COARSE = {"smoothness": 10, "voters": 10, "tolerance": 100}
+COARSE = {"smoothness": 10, "voters": 10}
 """Constants of which only the order of magnitude counts, and factors."""
 
 

@@ -7,15 +7,14 @@ blocks wider than that reach holds all of it (the block estimator of the long-ru
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.owned_pixels import score_sums
-from rgbmidic.correlation.assembly import block_side
+from rgbmidic.correlation.assembly import block_number
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh.pixel_map import window_sums
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -30,7 +29,7 @@ class BlockTable:
 
     Attributes
     ----------
-    sums : ndarray, shape (n, 4, h, w) or (n, 6, h, w)
+    sums : ndarray, shape (k, 6, h, w)
         Scores ``w r grad f`` in x and y, their information ``w |grad f|^2`` in both, and the number of pixels with
         weight; then ``w grad f . grad`` of the grey levels of the reference and of the deformed image.
     side : int
@@ -44,36 +43,33 @@ class BlockTable:
     reference: Reference
 
     @classmethod
-    def of(cls, reference: Reference, side: int, rows: Iterable[tuple[FloatImage, ...]]) -> BlockTable:
-        """Sum for each row of the table its lights' residuals, weights, and gradients along x and y, all (k, P).
-
-        The last two sums need the grey levels of the reference over their local mean, twice.
-        """
-        pixels, sums = reference.pixels, []
-        for fields in rows:
-            out = np.empty((len(fields), *pixels.grid(side)), dtype=np.float32)
-            columns = (*fields, *fields[:2])[:6]
-            score_sums(*columns, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
-            sums.append(out)
-        return cls(sums=np.array(sums, dtype=np.float64), side=side, reference=reference)
-
-    @classmethod
-    def of_lights(cls, residual: Residual, weights: FloatImage, side: int) -> BlockTable:
-        """Sum each light for itself, with the weights (k, P) of the solve."""
+    def of(cls, residual: Residual, weights: FloatImage, gradient: FloatImage | None = None) -> BlockTable:
+        """Sum each light for itself, with the weights (k, P) of a solve and a `gradient` (2, k, P) that it is not."""
         reference = residual.reference
-        lights = (
-            (values[None] for values in light)
-            for light in zip(residual.difference, weights, *reference.gradient, strict=True)
-        )
-        return cls.of(reference, side, map(tuple, lights))
+        pixels, side = reference.pixels, reference.constants.min_block_side
+        sums = np.empty((len(weights), 6 if gradient is None else 4, *pixels.grid(side)), dtype=np.float32)
+        columns = residual.difference, weights, *(reference.gradient if gradient is None else gradient)
+        # the last two sums need the grey levels of the reference over their local mean, twice
+        columns += (reference.relative_values,) * 2 if gradient is None else columns[:2]
+        for light, out in enumerate(sums):
+            fields = (column[light : light + 1] for column in columns)
+            score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
+        return cls(sums=sums.astype(np.float64), side=side, reference=reference)
 
-    @classmethod
-    def of_all(cls, residual: Residual, weights: FloatImage) -> BlockTable:
-        """Sum all lights together, over blocks that grow with the elements."""
-        reference = residual.reference
-        side = block_side(reference.pixels, reference.mesh.size, reference.constants)
-        relative = reference.relative_values
-        return cls.of(reference, side, [(residual.difference, weights, *reference.gradient, relative, relative)])
+    def wider(self) -> BlockTable:
+        """Return the table over blocks that grow with the elements: what these cannot follow is alike over them."""
+        number = block_number(self.reference.pixels, self.reference.mesh.size, self.reference.constants)
+        padding = (-size % number for size in self.sums.shape[-2:])
+        padded = np.pad(self.sums, [(0, 0), (0, 0), *((0, more) for more in padding)])
+        rows, columns = (size // number for size in padded.shape[-2:])
+        sums = padded.reshape(*padded.shape[:2], rows, number, columns, number).sum(axis=(3, 5))
+        return replace(self, sums=sums, side=self.side * number)
+
+    def together(self) -> BlockTable:
+        """Return the table of all lights as one, whose pixels are those of the light that shows most of a block."""
+        sums = self.sums.sum(axis=0)
+        sums[3] = self.sums[:, 3].max(axis=0)
+        return replace(self, sums=sums[None])
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:
         """Interpolate grids (n, h, w) at points (M, 2) in px, (n, M)."""
@@ -138,7 +134,8 @@ class BlockTable:
 
         Where glare or paint has changed since, the deformed image shows less of it. 1 where there is no texture.
         """
-        reference, deformed = self.at(self.sums[0, 4:], points)
+        smoothing = self.reference.constants.information_smoothing
+        reference, deformed = self.at(np.stack([window_sums(grid, smoothing) for grid in self.sums[0, 4:]]), points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
     def windowed_sums(self, grids: AnyArray) -> AnyArray:

@@ -272,7 +272,7 @@ def window_width(
                 f, ff, slope, total = f[textured], ff[textured], slope[textured], total[textured]
                 lengths.append(np.sqrt(np.median(np.maximum(ff - f * f / total, 0) / slope)))
         length = float(np.median(lengths)) if lengths else 0.0
-        return max(constants.gain_window_factor * length, constants.min_gain_window)
+        return max(constants.gain_window_factor * length, 6.0)  # one and a half blocks of its grid
 
     # over the region at first, in which shading counts as speckle
     sigma = width([grid.sum(axis=(1, 2))[:, None] for grid in grids])

@@ -27,10 +27,6 @@ class SolverConstants:
         Fraction of the nodes that are not measured if they still move at the end: a few at the rim of a fragment, half
         of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen; half or twice
         of it matters in a deep shadow and with rigid motions of the lights, by .15 of the stated uncertainty.
-    min_stretch_change, max_stretch_change
-        Rms change of the inverse stretch ``C^-1 - 1`` (twice the strain) from which the reference is filtered as the
-        deformed images are: at a strain of 5 % that takes an error of .0016 px, at half a per cent a tenth. Its
-        largest change: a surface compressed to .45, beyond which the filter's first term does not hold. Chosen.
     smoothness
         Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian.
         Chosen; with a tenth or ten times of it lights under a reflection differ by 2e-6 px at most, beside a gap by
@@ -79,14 +75,12 @@ class SolverConstants:
     gain_window_ratio
         The window over the narrower one that follows such a light: plain speckle then errs by 3 % more, a shadow's edge
         by half (benchmarks/grey_levels.py).
-    min_gain_window
-        ... and at least, px: one and a half blocks of its grid.
     min_block_side
-        Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter.
+        Side (px) of the blocks of the table: wider than a speckle and any filter.
     block_side_per_element
-        Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the
-        error of 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times
-        (DIC Challenge).
+        Side, in sides of an element, of the squares of blocks that are taken together where the elements are large:
+        what these cannot follow is alike over about that. With 13 px the error of 40 px elements on waves of 3 to 5
+        elements was 1.5 to 2.3 times the stated one, with 30 px 0.8 to 1.2 times (DIC Challenge).
     score_range
         Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to
         12 % (derived). With half or twice of it lights differ by 1e-3 px at most, beside a gap by 2e-3, their
@@ -123,8 +117,6 @@ class SolverConstants:
     min_initial_zncc: float = 0.25
     reweight_motion: float = 0.02
     max_oscillating_fraction: float = 0.02
-    min_stretch_change: float = 0.01
-    max_stretch_change: float = 4.0
     smoothness: float = 1e-4
     min_texture: float = 0.05
     min_information: float = 0.01
@@ -141,7 +133,6 @@ class SolverConstants:
     gain_window_factor: float = 6.0
     max_smooth_fraction: float = 0.25
     gain_window_ratio: float = 3.0
-    min_gain_window: float = 6.0
     min_block_side: int = 13
     block_side_per_element: float = 0.75
     score_range: float = 30.0

@@ -153,13 +153,12 @@ class Residual:
         -------
         ndarray, shape (P,), float32
         """
-        reference = self.reference
-        block = reference.constants.min_block_side
-        table = BlockTable.of(reference, block, [(difference[None], weight[None], *reference.texture.texture[:, None])])
+        mean, texture = replace(self, difference=difference[None]), self.reference.texture.texture[:, None]
+        table = BlockTable.of(mean, weight[None], texture)
         xx, _, yy = table.design_effect()[0]
         # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
         fraction = np.maximum(xx + yy, 0.01)
-        return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
+        return np.asarray(self.reference.pixels.from_blocks(fraction[None], table.side)[0])
 
     @property
     def smooth_fraction(self) -> float:

@@ -268,7 +268,8 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
     recovery = Recovery.over(reference.material, active, equations.information(reference))
     fitted = estimate.displacement
     residual = weighting.residual.subtract_curvature(*map(equations.turned_back, recovery.offset_and_curvature(fitted)))
-    table = BlockTable.of_all(residual, equations.weights)
+    lights = BlockTable.of(residual, equations.weights)
+    table = lights.wider().together()
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
         step = recovery.value @ gradient_step(weighting.residual, equations)
@@ -276,7 +277,6 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
         std = std * np.hypot(1, excess)[:, None]
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        lights = BlockTable.of_lights(residual, equations.weights, problem.constants.min_block_side)
         bias, bias_std = light_bias(lights, equations)
     sensitivity = table.sensitivity(mesh.nodes)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]

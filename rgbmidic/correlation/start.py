@@ -70,6 +70,13 @@ class Keypoints:
     descriptors: FloatImage
 
 
+MIN_CONFIDENCE = 0.15
+"""Confidence from which an initial guess is worth a solve: another specimen gives at most .1 (benchmarks/starts.py)."""
+
+_VOTES = 4
+"""Pairs around a pair that must agree with it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
     """The search for initial guesses, with its constants.
@@ -82,61 +89,31 @@ class Search:
     flat
         Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
         or twice of it results differ by 2e-4 px at most, elsewhere as above (benchmarks/constants.py).
-    grey
-        Grey levels of the picture's local standard deviation: three of them fit into 8 bits.
     contrast
         SIFT's threshold: lower ones add keypoints that noise makes, at .12 a jittered lattice loses most (measured).
-    voters, votes
-        Pairs around a pair that vote on it, and how many must agree: with wrong pairs in a picture of 1 Mpx it happens
+    voters
+        Pairs around a pair that vote on it, of which four must agree: with wrong pairs in a picture of 1 Mpx it happens
         to one in 1000 by chance.
-    tolerance
-        Disagreement over distance that angle and size of a keypoint are good for, strains of 20 % included.
     sufficient_confidence
         Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured).
     min_correlation
         Correlation coefficient from which the images around a node agree: noise is half of their variance then
         (derived).
-    min_correlation_at_rest
-        The same at rest, which is not asked of a search: at 0.5, speckles of 7 px were off by 2.6 px.
-    reductions
-        How many times pictures are reduced in turn.
-    small
-        Side (px) of regions up to which pictures of full size are looked at: larger ones have keypoints enough at half.
     keypoints
         Most keypoints of the reference: 1500 cost half again as much and were no surer on 1024 px (measured).
-    max_deformed_keypoints
-        Most keypoints of the deformed image, where there are as many per area.
     context
         Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
         differ by 1.3e-3 px at most, elsewhere as above (benchmarks/constants.py).
-    min_confidence
-        Confidence from which an initial guess is worth a solve: another specimen gives at most .1
-        (benchmarks/starts.py).
-    loss
-        Fraction of the nodes whose loss each further guess makes acceptable, half of it at the first: a few may really
-        go, as the 1 to 2 % at the edge of a turning fragment do.
-    turn
-        Turn (degrees) that is found, with strains of 20 % or alone (benchmarks/starts.py).
     """
 
     normalise: float = 6.0
     flat: float = 0.1
-    grey: int = 40
     contrast: float = 0.06
     voters: int = 30
-    votes: int = 4
-    tolerance: float = 0.3
     sufficient_confidence: float = 0.95
     min_correlation: float = 0.5
-    min_correlation_at_rest: float = 0.8
-    reductions: tuple[int, ...] = (8, 4, 2, 1)
-    small: float = 300.0
     keypoints: int = 1000
-    max_deformed_keypoints: int = 5000
     context: float = 24.0
-    min_confidence: float = 0.15
-    loss: float = 0.04
-    turn: float = 30.0
 
     def candidates(
         self, reference: Reference, deformed: Deformed, last: FloatArray | None = None
@@ -165,12 +142,13 @@ class Search:
 
         if last is None:
             residual = compared(predicted)
-            if (
-                rest_confidence := self.confidence(residual, self.min_correlation_at_rest)
-            ) >= self.sufficient_confidence:
+            # which is not asked of a search: at .5, speckles of 7 px were off by 2.6 px
+            rest_confidence = self.confidence(residual, min_correlation=0.8)
+            if rest_confidence >= self.sufficient_confidence:
                 yield InitialGuess(displacement=predicted, confidence=rest_confidence, residual=residual)
                 return
-        small = float(np.ptp(nodes, axis=0).max()) <= self.small
+        # larger regions have keypoints enough at half the size
+        reductions = (8, 4, 2, 1) if float(np.ptp(nodes, axis=0).max()) <= 300 else (8, 4, 2)
         slopes = reference.mesh.nodal_gradient(predicted)
         reference_window = _window_around(nodes, self.context, reference.images.shape[1:])
         positions = np.concatenate([nodes, nodes + predicted]) - offset
@@ -179,11 +157,9 @@ class Search:
             self.keypoints * deformed.weights[0][deformed_window].size / reference.weights[0][reference_window].size
         )
         best, (images, weights) = 0.0, deformed.images_on_first_light(reference.registration)
-        for reduction in self.reductions if small else self.reductions[:-1]:
+        for reduction in reductions:
             f = self._keypoints(reference.images, reference.weights, reference_window, reduction, self.keypoints)
-            g = self._keypoints(
-                images, weights, deformed_window, reduction, int(min(as_dense, self.max_deformed_keypoints))
-            )
+            g = self._keypoints(images, weights, deformed_window, reduction, int(min(as_dense, 5000)))
             if f is None or g is None:
                 continue
             points, motion = self._pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
@@ -220,7 +196,8 @@ class Search:
         if min(side.stop - side.start for side in window) // reduction < 2 * self.normalise:
             return None
         picture, weight_sum = self._picture(images, weights, window, reduction)
-        grey = np.clip(128 + self.grey * picture, 0, 255).astype(np.uint8)
+        # three standard deviations of the picture fit into 8 bits
+        grey = np.clip(128 + 40 * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT.create(contrastThreshold=self.contrast, enable_precise_upscale=True)
         detected = sift.detect(grey, None)
@@ -250,7 +227,7 @@ class Search:
         first_index = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
         second_index = nearest[first_index]
         points, motion = first.points[first_index], second.points[second_index] - first.points[first_index]
-        if len(first_index) <= self.votes:
+        if len(first_index) <= _VOTES:
             return points[:0], motion[:0]
         neighbours = np.asarray(cKDTree(points).query(points, k=min(self.voters + 1, len(points)))[1])[:, 1:]
         step = points[neighbours] - points[:, None]
@@ -261,8 +238,9 @@ class Search:
         cos, sin = (scale * np.cos(turn))[:, None], (scale * np.sin(turn))[:, None]
         turned = np.stack([cos * step[..., 0] - sin * step[..., 1], sin * step[..., 0] + cos * step[..., 1]], axis=-1)
         off = np.linalg.norm(motion[neighbours] - motion[:, None] - (turned - step), axis=-1)
-        votes = (off <= tolerance + self.tolerance * np.linalg.norm(step, axis=-1)).sum(axis=1)
-        return points[votes >= self.votes], motion[votes >= self.votes]
+        # what angle and size of a keypoint are good for, strains of 20 % included
+        votes = (off <= tolerance + 0.3 * np.linalg.norm(step, axis=-1)).sum(axis=1)
+        return points[votes >= _VOTES], motion[votes >= _VOTES]
 
     def _picture(
         self, images: FloatImage, weights: FloatImage, window: tuple[slice, slice], reduction: int
@@ -473,12 +451,12 @@ def track(
     candidates = timed_items("search", search.candidates(reference, deformed, state.displacement))
     for number, guess in enumerate(chain(last, candidates)):
         surest = float(np.fmax(surest, guess.confidence))
-        if guess.confidence < search.min_confidence:
+        if guess.confidence < MIN_CONFIDENCE:
             continue
         trial = solve(reference, deformed, guess.displacement, options, method, guess.residual)
         if best is None or rank(trial.status, trial.node_status) < rank(best.status, best.node_status):
             best = trial
-        acceptable = state.unmeasured + (number + 0.5) * search.loss
+        acceptable = state.unmeasured + (number + 0.5) * 0.04  # 1 to 2 % do go at the edge of a turning fragment
         if best.status is Status.CONVERGED and best.unmeasured_fraction <= acceptable:
             break
     if best is None:  # from rest, for the reason why there is no start
@@ -487,11 +465,10 @@ def track(
         return best
     explanation = (
         f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of "
-        f"{search.min_confidence:.0%} needed. Looked for were motions up to the region's longer side, at least 128 px, "
-        "and turns up to about "
-        f"{search.turn:g} degrees: take frames in between"
+        f"{MIN_CONFIDENCE:.0%} needed. Looked for were motions up to the region's longer side, at least 128 px, "
+        "and turns up to about 30 degrees: take frames in between"
     )
-    if surest >= search.min_confidence:
+    if surest >= MIN_CONFIDENCE:
         explanation = (
             f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
         )

@@ -12,7 +12,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation.assembly import RigidMotions, block_side
+from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
@@ -75,9 +75,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     if lost.ndim:
         lost = np.repeat(lost, np.diff(pixels.offsets))
     full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
-    table = BlockTable.of_lights(
-        replace(residual, difference=full_difference), weights, block_side(pixels, mesh.size, reference.constants)
-    )
+    table = BlockTable.of(replace(residual, difference=full_difference), weights).wider()
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
     roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
@@ -250,7 +248,7 @@ def excess_over_chance(
         Of the solve.
     """
     reference = table.reference
-    images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
+    images = BlockTable.of(residual, weights, reference.texture.images).wider().together()
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
         (images.sums - table.sums[:, :4])[0, :2]
     )

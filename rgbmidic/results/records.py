@@ -259,12 +259,13 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
     ResultError
         The disk is full or refuses, or the check fails; nothing is left of the frame.
     """
-    buffer, contents = io.BytesIO(), {name: npy_bytes(record.values[name]) for name in QUANTITIES}
+    buffer, (files, _) = io.BytesIO(), _layout(tuple(QUANTITIES))
+    contents = {name: npy_bytes(record.values[name]) for name in files}
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, entry in QUANTITIES.items():
             is_picture = entry.dtype is np.uint8 and not entry.is_stackable
             method = zipfile.ZIP_DEFLATED if is_picture else zipfile.ZIP_STORED
-            file_info = zipfile.ZipInfo(_FILES[name].decode())  # without a date: the same bits each time
+            file_info = zipfile.ZipInfo(files[name].decode())  # without a date: the same bits each time
             archive.writestr(file_info, contents[name], method, zlib.Z_BEST_SPEED)
         archive.comment = _COMMENT.pack(run, frame)
     content = buffer.getbuffer()

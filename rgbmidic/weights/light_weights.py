@@ -383,17 +383,9 @@ class Statistics(ValidPixels):
         Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84,
         1989, who found 4 to work well). With 2 or 8 lights under a reflection differ by 3e-3 px at most, beside a gap
         by 5e-3, their uncertainty by 4 % (benchmarks/constants.py).
-    least_variance
-        Least variance of a light's residual that is believed, over the median of all. Chosen; half or twice of it
-        changes nothing (benchmarks/constants.py).
-    rounding
-        Least variance of a residual, over that of the grey levels, where two images are the same: none is 0.
     independent_fraction
         Fraction of its variance that each light's residual is taken to have for itself. Chosen; with half or twice of
         it lights differ by 2e-4 px at most (benchmarks/constants.py).
-    rim_excess
-        Variance at the rim of the region over that inside from which the rim shows another body, such as a background
-        at rest, and has its own: of the some 16 values of a window chance makes 4 times in 1 of 1e7 (derived).
     window
         In which variances are found.
 
@@ -409,10 +401,7 @@ class Statistics(ValidPixels):
     """
 
     freedom: float = 4.0
-    least_variance: float = 0.1
-    rounding: float = 1e-6
     independent_fraction: float = 0.1
-    rim_excess: float = 4.0
     window: SlidingWindow = WINDOW
 
     def precision(self, residual: Residual) -> Precision:
@@ -444,7 +433,7 @@ class Statistics(ValidPixels):
         typical = _typical(covariance[lights, lights])
         if typical <= 0:
             return Precision(factor=np.ones_like(weights), loss_curvature=np.ones_like(weights[0]))
-        floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
+        floor = np.float32(1e-6 * residual.contrast)  # where two images are the same no variance is 0
         factor = pixels.from_blocks(_best_fractions(covariance, floor, self.independent_fraction), self.window.step)
         mean, has_weight, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, has_weight)
@@ -456,7 +445,8 @@ class Statistics(ValidPixels):
         unit = max(np.float32(_typical(variance)), min_variance)
         variance, rim_variance = np.maximum((variance, rim_variance), min_variance)
         variance_map = pixels.from_blocks(variance, self.window.step)[0]
-        differs = rim_variance > self.rim_excess * variance
+        # the rim shows another body: of the some 16 values of a window chance makes 4 times in 1 of 1e7
+        differs = rim_variance > 4 * variance
         if differs.any():
             rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
             np.copyto(variance_map, rim_map, where=rim > 0)
