@@ -48,7 +48,7 @@ class BlockTable:
     def of(cls, reference: Reference, side: int, rows: Iterable[tuple[FloatImage, ...]]) -> BlockTable:
         """Sum for each row of the table its lights' residuals, weights, and gradients along x and y, all (k, P).
 
-        The last two sums need the grey levels of the reference over their local mean, twice.
+        The last two sums need the grey levels of the reference, and one over their local mean.
         """
         pixels, sums = reference.pixels, []
         for fields in rows:
@@ -73,8 +73,8 @@ class BlockTable:
         """Sum all lights together, over blocks that grow with the elements."""
         reference = residual.reference
         side = block_side(reference.pixels, reference.mesh.size, reference.constants)
-        relative = reference.relative_values
-        return cls.of(reference, side, [(residual.difference, weights, *reference.gradient, relative, relative)])
+        states = residual.difference, weights, *reference.gradient, reference.values, reference.inverse_level
+        return cls.of(reference, side, [states])
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:
         """Interpolate grids (n, h, w) at points (M, 2) in px, (n, M)."""
