@@ -219,13 +219,14 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
 
 @compiled("out", axis=1, fastmath=FAST)
 def score_sums(
-    start, stop, residual, weights, gradient_x, gradient_y, values, corrected, lines, run_offsets, offsets, side, out,
+    start, stop, residual, weights, gradient_x, gradient_y, values, inverse_level, lines, run_offsets, offsets, side,
+    out,
 ):  # fmt: skip
     """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
 
     ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight. One of (6, h, w)
-    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` and for
-    the `corrected` ones without the residual.
+    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` times the
+    `inverse_level` and for those less the residual.
     """
     out[:, start:stop] = 0
     columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
@@ -254,8 +255,8 @@ def score_sums(
             for i in range(number):
                 w = _HALF * weights[light, first + i]
                 states[0, i], states[1, i] = w * gradient_x[light, first + i], w * gradient_y[light, first + i]
-                states[2, i] = values[light, first + i]
-                states[3, i] = corrected[light, first + i] - residual[light, first + i]
+                states[2, i] = values[light, first + i] * inverse_level[light, first + i]
+                states[3, i] = states[2, i] - residual[light, first + i]
             for i in range(number - one):
                 mean = inside[i] * (states[0, i] + states[0, i + one])
                 scores[4, i] += mean * (states[2, i + one] - states[2, i])

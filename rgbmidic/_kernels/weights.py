@@ -11,14 +11,15 @@ _ONE = np.float32(1.0)
 
 
 @compiled("fraction", axis=1, grain=BLOCK, fastmath=FAST)
-def best_mean(start, stop, fraction, weights, difference, mean, has_weight):
+def best_mean(start, stop, fraction, weights, difference, rim, mean, has_weight):
     """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.
 
-    `mean` (P,) receives that of `difference` (k, P), and `has_weight` (P,) 1 where a light has a fraction, else 0.
+    `mean` (P,) receives that of `difference` (k, P). Where a light has a fraction the first of `has_weight` (2, P)
+    receives 1 less the `rim` (P,), and the second the rim; else 0.
     """
     for first in range(start, stop, BLOCK):
         chunk = slice(first, min(first + BLOCK, stop))
-        total, result = has_weight[chunk], mean[chunk]
+        total, at_rim, result, edge = has_weight[0, chunk], has_weight[1, chunk], mean[chunk], rim[chunk]
         total[:] = 0
         result[:] = 0
         for light in range(len(fraction)):
@@ -33,6 +34,8 @@ def best_mean(start, stop, fraction, weights, difference, mean, has_weight):
                 result[i] += light_fraction[i] * value[i]
         for i in range(np.uint64(total.size)):
             total[i] = _ONE if total[i] > _ZERO else _ZERO
+            at_rim[i] = total[i] * edge[i]
+            total[i] -= at_rim[i]
 
 
 @compiled("fraction", axis=1, grain=BLOCK, fastmath=FAST)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
@@ -320,7 +321,7 @@ def mean_residual_leverage(
         unit[:, [0, 1], [0, 1]] = inner[:, None] * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)
         nodal_noise = solve(unit.reshape(-1, 2)).T
         fitted = solutions.reshape(-1, stride**2, 2).sum(axis=1).T
-        sign = sign[(pixels.rows - first_row) // side, (pixels.columns - first_column) // side]
+        sign = pixels.from_blocks(sign[None], side, cv2.INTER_NEAREST)[0]
         shared_arguments = mesh, pixels, images, prefilter
         passed = [
             (
@@ -364,7 +365,9 @@ def _passed(
     motion[0] -= blocks[0]
     motion[1] -= blocks[1]
     for gx, gy, weight in zip(*images[0], images[1], strict=True):
-        image = np.sqrt(weight) * (gx * motion[0] + gy * motion[1])
-        energy += float((image**2).sum(dtype=np.float64))
-        passed += float((apply_prefilter(pixels.scatter(image), prefilter) ** 2).sum(dtype=np.float64))
+        image = gx * motion[0]
+        image += gy * motion[1]
+        image *= np.sqrt(weight)
+        energy += cv2.norm(image, cv2.NORM_L2SQR)
+        passed += cv2.norm(apply_prefilter(pixels.scatter(image), prefilter), cv2.NORM_L2SQR)
     return passed / energy if energy else 1.0

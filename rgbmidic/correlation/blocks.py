@@ -49,8 +49,8 @@ class BlockTable:
         pixels, side = reference.pixels, reference.constants.min_block_side
         sums = np.empty((len(weights), 6 if gradient is None else 4, *pixels.grid(side)), dtype=np.float32)
         columns = residual.difference, weights, *(reference.gradient if gradient is None else gradient)
-        # the last two sums need the grey levels of the reference over their local mean, twice
-        columns += (reference.relative_values,) * 2 if gradient is None else columns[:2]
+        # the last two sums need the grey levels of the reference, and one over their local mean
+        columns += (reference.values, reference.inverse_level) if gradient is None else columns[:2]
         for light, out in enumerate(sums):
             fields = (column[light : light + 1] for column in columns)
             score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)

@@ -18,7 +18,7 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
 from rgbmidic.mesh import PixelMap
 from rgbmidic.mesh.pixel_map import SlidingWindow, window_sums
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
 """The setting ``solver.brightness``."""
@@ -193,51 +193,47 @@ def gain_and_offset(moments: FloatArray, centres: FloatArray, min_correlation: f
     total, f, g = np.moveaxis(moments[..., :3], 2, 0)
     fg, ff, gg = centred_products(moments)
     offsets[:, 0] = (g.sum(axis=1) - f.sum(axis=1)) / np.maximum(total.sum(axis=1), 1e-30)
-    is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(np.maximum(ff * gg, 0)))
-    number = is_correlated.sum(axis=1)
-    lights = np.flatnonzero(number > 0.1 * (ff > 0).sum(axis=1))
-    if lights.size:  # all have samples of one size, in which elements of a light with fewer are repeated
-        count = min(int(number[lights].max()), ELEMENTS)
-        ranks = np.arange(count) * number[lights, None] // count
-        sample = np.stack(
-            [np.flatnonzero(is_correlated[light])[rank] for light, rank in zip(lights, ranks, strict=True)]
-        )
-        total, f, g, ff, gg = (values[lights[:, None], sample] for values in (total, f, g, ff, gg))
-        ratios = np.sqrt(gg / ff)
-        gains[lights] = np.median(ratios, axis=1)
-        offsets[lights] = _offset_planes(centres[sample], (g - ratios * f) / total, number[lights] >= 12)
+    is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(ff * gg))
+    for light, candidates in enumerate(is_correlated):
+        if candidates.sum() > 0.1 * (ff[light] > 0).sum():
+            sample = np.flatnonzero(candidates)[:: 1 + int(candidates.sum()) // ELEMENTS]
+            gain = np.sqrt(gg[light, sample] / ff[light, sample])
+            gains[light] = np.median(gain)
+            level = (g[light, sample] - gain * f[light, sample]) / total[light, sample]
+            offsets[light] = _offset_plane(centres[sample], level)
     return gains, offsets
 
 
-def _offset_planes(points: FloatArray, values: FloatArray, is_fitted: BoolArray) -> FloatArray:
-    """Fit constants and slopes (k, 3) of planes to offsets (k, M) at points (k, M, 2), with Cauchy weights.
+def _offset_plane(points: FloatArray, values: FloatArray) -> FloatArray:
+    """Fit constant and slopes (3,) of a plane to offsets (M,) at points (M, 2), with Cauchy weights.
 
-    Reflections give single elements offsets, too: of a plane the fraction counts that it has of its mean square and
-    of the scatter about it together. What is not fitted, with fewer than four elements for each unknown, is constant.
+    Reflections give single elements offsets, too: of the plane the fraction counts that it has of its mean square and
+    of the scatter about it together.
     """
-    middle = points.mean(axis=1, keepdims=True)
-    size = np.maximum(np.ptp(points, axis=1).max(axis=1), 1.0)[:, None, None]
-    basis = np.concatenate([np.ones((*values.shape, 1)), (points - middle) / size], axis=2).transpose(0, 2, 1)
-    functions, held = np.concatenate([basis, values[:, None]], axis=1), np.diag([1e-6, *[1e-3 * values.shape[1]] * 2])
-    level = np.median(values, axis=1)
-    plane, scatter, weight = np.pad(level[:, None], ((0, 0), (0, 2))), _scatter(values - level[:, None]), np.float64(1)
-    for _ in range(10 if is_fitted.any() else 0):  # until weights and scatter have settled
-        # no BLAS, whose sums may depend on the number of threads
-        sums = np.einsum("kam,kbm->kab", basis * weight, functions)
-        fitted = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0]
-        plane = np.where(is_fitted[:, None], fitted, plane)
-        deviation = values - np.einsum("ka,kam->km", plane, basis)
+    middle, size = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1.0)
+    basis = np.stack([np.ones(len(points)), *((points - middle) / size).T])
+    functions, held = np.concatenate([basis, values[None]]), np.diag([1e-6, *[1e-3 * len(points)] * 2])
+    plane, deviation = np.array([np.median(values), 0.0, 0.0]), values - np.median(values)
+    scatter = _scatter(deviation)
+    for _ in range(3 if len(points) >= 12 else 0):  # of four elements for each unknown, until the scatter has settled
+        if not scatter:
+            break
+        weight = np.ones(len(points))
+        for _ in range(5):  # as in `robust_fit`
+            sums = np.einsum("am,bm->ab", basis * weight, functions)  # no BLAS, whose sums may depend on threads
+            plane = np.linalg.solve(sums[:, :3] + held, sums[:, 3])
+            deviation = values - np.einsum("a,am->m", plane, basis)
+            weight = 1 / (1 + (deviation / scatter) ** 2)
         scatter = _scatter(deviation)
-        weight = 1 / (1 + (deviation / np.where(scatter > 0, scatter, 1.0)[:, None]) ** 2)[:, None]
-    square = (np.einsum("ka,kam->km", plane, basis) ** 2).mean(axis=1)
-    plane *= (square / np.maximum(square + scatter**2, 1e-300))[:, None]
-    slopes = plane[:, 1:] / size[:, 0]
-    return np.column_stack([plane[:, 0] - (slopes * middle[:, 0]).sum(axis=1), slopes])
+    square = float((np.einsum("a,am->m", plane, basis) ** 2).mean())
+    plane = plane * square / max(square + scatter**2, 1e-300)
+    slopes = plane[1:] / size
+    return np.array([plane[0] - slopes @ middle, *slopes])
 
 
-def _scatter(values: FloatArray) -> FloatArray:
-    """Return the standard deviation (k,) of normal distributions with the same median of the absolute values (k, M)."""
-    return np.asarray(1.5 * np.median(np.abs(values), axis=1))
+def _scatter(values: FloatArray) -> float:
+    """Return the standard deviation of a normal distribution with the same median of the absolute values."""
+    return 1.5 * float(np.median(np.abs(values)))
 
 
 def window_width(
@@ -260,10 +256,15 @@ def window_width(
         Of the solve.
     """
     step = SlidingWindow().step
-    grids = [
-        pixels.block_sums(np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w]), step).astype(np.float64)
-        for f, gx, gy, w in zip(values, *gradient, weights, strict=True)
-    ]
+    grids, products = [], np.empty((4, values.shape[1]), dtype=np.float32)
+    for f, gx, gy, w in zip(values, *gradient, weights, strict=True):
+        np.multiply(f, w, out=products[0])
+        np.multiply(f, products[0], out=products[1])
+        np.multiply(gx, gx, out=products[2])
+        products[2] += np.multiply(gy, gy, out=products[3])
+        products[2] *= w
+        products[3] = w
+        grids.append(pixels.block_sums(products, step).astype(np.float64))
 
     def width(moments: list[FloatArray]) -> float:
         lengths = []

@@ -392,11 +392,6 @@ class Reference(Derivable):
         """Standard deviation (px) of the window of the gain; None where the gain is one number."""
         return None if self.gain_fit is None else self.gain_fit.sigma
 
-    @property
-    def relative_values(self) -> FloatImage:
-        """Grey levels (k, P) over their local means."""
-        return self.values * self.inverse_level
-
     def channel_specific(self, light: int) -> FloatImage:
         """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
 
@@ -669,7 +664,8 @@ def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigm
         else:
             window = SlidingWindow(sigma=sigma)
             out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
-            below[light] = (w * (out < 0)).sum() / max(w.sum(), np.float32(1e-30))
+            if out.min() < 0:
+                below[light] = (w * (out < 0)).sum() / max(w.sum(), np.float32(1e-30))
             np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
     if below.min() > 0.1:  # one of several lights may be off
         raise InputError(

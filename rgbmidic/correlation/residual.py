@@ -394,7 +394,7 @@ def _reduced(residual: Residual, side: int, border: int) -> FloatImage:
     count = pixels.block_sums(weights, side)
     level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
     pictures = []
-    f = residual.reference.relative_values
+    f = residual.reference.values * residual.reference.inverse_level
     for values in (f, f - residual.difference):
         sums = pixels.block_sums(values * weights, side)
         mean = sums.sum(axis=(1, 2), dtype=np.float64)[:, None, None] / np.maximum(level, 1e-30)

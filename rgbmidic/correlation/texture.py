@@ -61,9 +61,12 @@ class TextureGradient:
         averaged, and from which the others are. Of two lights both are: a single other one may be the one that
         reflects.
         """
+        if len(weights) == 1:
+            blank = np.zeros((1, *pixels.grid(WINDOW.step)), dtype=np.float32)
+            return cls(images=gradient, texture=gradient[:, 0], in_others=blank, in_all=blank, mean_fraction=blank)
         has_weight, lights = (weights > 0).astype(np.float32), len(weights)
         scale = np.float32(lights) / np.maximum(has_weight.sum(axis=0), np.float32(1))
-        texture = np.einsum("akp,kp->ap", gradient, has_weight) * scale if lights > 1 else gradient[:, 0]
+        texture = np.einsum("akp,kp->ap", gradient, has_weight) * scale
         grids = []
         for light, weight in zip(gradient.swapaxes(0, 1), has_weight, strict=True):
             products = np.stack(

@@ -226,7 +226,7 @@ class PixelMap:
         weighted_block_sums(values, weights, self.lines, self.run_offsets, side, out)
         return out
 
-    def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
+    def from_blocks(self, grids: FloatImage, side: int, interpolation: int = cv2.INTER_LINEAR) -> FloatImage:
         """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P).
 
         Parameters
@@ -235,6 +235,8 @@ class PixelMap:
             Values at the centres of the blocks.
         side
             Side of the blocks in px.
+        interpolation
+            One of OpenCV's.
 
         Returns
         -------
@@ -243,7 +245,7 @@ class PixelMap:
         out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
         size = grids.shape[2] * side, grids.shape[1] * side
         for grid, values in zip(grids.astype(np.float32, copy=False), out, strict=True):
-            image = np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
+            image = np.asarray(cv2.resize(grid, size, interpolation=interpolation))
             from_image(self.lines, image[None], 0, 0, values[None])
         return out
 

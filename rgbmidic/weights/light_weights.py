@@ -435,13 +435,10 @@ class Statistics(ValidPixels):
             return Precision(factor=np.ones_like(weights), loss_curvature=np.ones_like(weights[0]))
         floor = np.float32(1e-6 * residual.contrast)  # where two images are the same no variance is 0
         factor = pixels.from_blocks(_best_fractions(covariance, floor, self.independent_fraction), self.window.step)
-        mean, has_weight, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
-        best_mean(factor, weights, residual.difference, mean, has_weight)
         rim, min_variance = residual.reference.rim, floor / len(factor)
-        variance, rim_variance = (
-            self.window.covariance(pixels, mean[None], counted[None])[0]
-            for counted in (has_weight * (1 - rim), has_weight * rim)
-        )
+        mean, bend, has_weight = np.empty_like(rim), np.empty_like(rim), np.empty((2, rim.size), dtype=np.float32)
+        best_mean(factor, weights, residual.difference, rim, mean, has_weight)
+        variance, rim_variance = (self.window.covariance(pixels, mean[None], part[None])[0] for part in has_weight)
         unit = max(np.float32(_typical(variance)), min_variance)
         variance, rim_variance = np.maximum((variance, rim_variance), min_variance)
         variance_map = pixels.from_blocks(variance, self.window.step)[0]
@@ -450,7 +447,10 @@ class Statistics(ValidPixels):
         if differs.any():
             rim_map = pixels.from_blocks(np.where(differs, rim_variance, variance), self.window.step)[0]
             np.copyto(variance_map, rim_map, where=rim > 0)
-        displacing = residual.design_effect(mean, has_weight / variance_map)
+        inner_weight, rim_weight = has_weight
+        inner_weight += rim_weight
+        inner_weight /= variance_map
+        displacing = residual.design_effect(mean, inner_weight)
         robust_weights(mean, variance_map, displacing, unit, np.float32(self.freedom), factor, bend)
         return Precision(factor=factor, loss_curvature=bend)
 

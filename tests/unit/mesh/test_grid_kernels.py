@@ -54,15 +54,17 @@ def test_sums_of_products_of_two_fields(pixels):
 @pytest.mark.parametrize(("side", "sums"), [(4, 6), (13, 6), (13, 4)])
 def test_scores_of_all_lights_together_and_the_slopes_of_both_states(pixels, side, sums):
     random = np.random.default_rng(1)
-    residual, gx, gy, f, corrected = random.normal(size=(5, 3, pixels.rows.size)).astype(np.float32)
+    residual, gx, gy, values, inverse = random.normal(size=(5, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
     out = np.full((sums, *pixels.grid(side)), 7, dtype=np.float32)
-    score_sums(residual, weight, gx, gy, f, corrected, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
+    lines = pixels.lines, pixels.run_offsets, pixels.offsets
+    score_sums(residual, weight, gx, gy, values, inverse, *lines, side, out)
     scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)
     fields = [*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)]
     element = np.repeat(np.arange(len(pixels.origin)), np.diff(pixels.offsets))
     slot = {place: n for n, place in enumerate(zip(element, pixels.rows, pixels.columns, strict=True))}
-    g, slopes = corrected - residual, np.zeros((2, residual.shape[1]))
+    f, slopes = values * inverse, np.zeros((2, residual.shape[1]))
+    g = f - residual
     for (e, row, column), a in slot.items():
         for gradient, beside in ((gx, (e, row, column + 1)), (gy, (e, row + 1, column))):
             if (b := slot.get(beside)) is not None:
