@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -48,11 +48,16 @@ _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run --resume` measures it again, `partial=True` reads the rest"
 
 
-_FILES = {name: f"{entry.file_name}.npy".encode() for name, entry in QUANTITIES.items()}
-"""Name of each array in the archive, by its quantity."""
-_ENTRIES = "".join(f"10xH4x2I18xI{len(file)}x" for file in _FILES.values())
-_DIRECTORY = struct.Struct(f"<{_ENTRIES}{_END_BYTES}x{_COMMENT.format.lstrip('<')}")
-"""The directory of every record: method, CRC-32, bytes and place of every array, run and frame."""
+@lru_cache(maxsize=4)
+def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct]:
+    """Lay out the directory of every record.
+
+    Returns the name of each array in the archive, by its quantity; and what is read of the directory, its end and the
+    comment: method, CRC-32, bytes and place of every array, run and frame.
+    """
+    files = {name: f"{QUANTITIES[name].file_name}.npy".encode() for name in names}
+    entries = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
+    return files, struct.Struct(f"<{entries}{_END_BYTES}x{_COMMENT.format.lstrip('<')}")
 
 
 class _Attribute:
@@ -274,22 +279,23 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
 
 def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
+    files, directory = _layout(tuple(QUANTITIES))
     with require_regular_file(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - _DIRECTORY.size, 0))
+        file.seek(max(size - directory.size, 0))
         content = file.read()
-        if len(content) != _DIRECTORY.size or zlib.crc32(content[:-4]).to_bytes(4, "little") != content[-4:]:
+        if len(content) != directory.size or zlib.crc32(content[:-4]).to_bytes(4, "little") != content[-4:]:
             raise ResultError("its directory is damaged or cut off")
-        *numbers, owner, number = _DIRECTORY.unpack(content)
+        *numbers, owner, number = directory.unpack(content)
         if owner != run:
             raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {RESTORE_REMEDY}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
         iterator = iter(numbers)
-        entries, values = dict(zip(_FILES, zip(iterator, iterator, iterator, iterator, strict=True), strict=True)), {}
+        entries, values = dict(zip(files, zip(iterator, iterator, iterator, iterator, strict=True), strict=True)), {}
         for name in names:
             method, check, length, offset = entries[name]
-            file.seek(offset + _LOCAL_BYTES + len(_FILES[name]))
+            file.seek(offset + _LOCAL_BYTES + len(files[name]))
             content = file.read(min(length, size))
             content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == zipfile.ZIP_DEFLATED else content
             if zlib.crc32(content) != check:
