@@ -76,9 +76,9 @@ def gradient_errors(
 def _deformation(tangents: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the deformation gradient F (G, 3, 2), the turn Q^T into its tangent plane (G, 2, 3), and M (G, 2, 2)."""
     to_axes = np.linalg.inv(tangent_axes(tangents).transpose(0, 2, 1) @ tangents)
-    gradient = (tangents + slopes) @ to_axes
+    gradient: FloatArray = np.asarray((tangents + slopes) @ to_axes)
     left_vectors, _, right_vectors = np.linalg.svd(gradient, full_matrices=False)
-    return np.asarray(gradient), (left_vectors @ right_vectors).transpose(0, 2, 1), to_axes
+    return gradient, np.asarray(left_vectors @ right_vectors).transpose(0, 2, 1), np.asarray(to_axes, dtype=np.float64)
 
 
 def measured_slopes(tangents: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
