@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import ELEMENTS, Brightness, block_side, gain_and_offset
+from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
@@ -163,14 +163,11 @@ class Residual:
     @property
     def smooth_fraction(self) -> float:
         """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
-        pixels, window = self.reference.pixels, self.reference.gain_window
-        if window is None:
+        if (fit := self.brightness.fit) is None:
             return 0.0
-        sums = pixels.weighted_block_sums(self.difference, self.weights, block_side(window), with_weights=True)
-        smooth, total = sums.reshape(2, -1).astype(np.float64)
-        return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(
-            float(self.squares(self.weights)[..., 0].sum()), 1e-300
-        )
+        smooth, total = fit.block_sums(self.difference).astype(np.float64), fit.totals
+        squares = float(self.squares(self.weights)[..., 0].sum())
+        return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(squares, 1e-300)
 
     def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
