@@ -182,7 +182,7 @@ def test_the_command_calibrates_checks_and_shows(photographs, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "left camera has 8 photographs, the right 6"),
+        (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "has 8 photographs, the right 6"),
         (["stereo", *options("views", **{"--right": "none/*.tif"})], "right: "),
         (["stereo", *options("check")], "5 simultaneous views of the target at least"),
         (["stereo", *options("views"), "--left-calibration", "a.json"], "belong together"),
