@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.owned_pixels import score_sums
-from rgbmidic.correlation.assembly import block_number
+from rgbmidic.correlation.assembly import block_side
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh.pixel_map import window_sums
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -43,10 +43,15 @@ class BlockTable:
     reference: Reference
 
     @classmethod
-    def of(cls, residual: Residual, weights: FloatImage, gradient: FloatImage | None = None) -> BlockTable:
-        """Sum each light for itself, with the weights (k, P) of a solve and a `gradient` (2, k, P) that it is not."""
-        reference = residual.reference
-        pixels, side = reference.pixels, reference.constants.min_block_side
+    def of(
+        cls, residual: Residual, weights: FloatImage, *, gradient: FloatImage | None = None, wide: bool = False
+    ) -> BlockTable:
+        """Sum each light for itself, with the weights (k, P) of a solve and a `gradient` (2, k, P) that it is not.
+
+        Wide blocks grow with the elements: what these cannot follow is alike over them.
+        """
+        reference, pixels, constants = residual.reference, residual.reference.pixels, residual.reference.constants
+        side = block_side(pixels, reference.mesh.size, constants) if wide else constants.min_block_side
         sums = np.empty((len(weights), 6 if gradient is None else 4, *pixels.grid(side)), dtype=np.float32)
         columns = residual.difference, weights, *(reference.gradient if gradient is None else gradient)
         # the last two sums need the grey levels of the reference, and one over their local mean
@@ -55,15 +60,6 @@ class BlockTable:
             fields = (column[light : light + 1] for column in columns)
             score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
         return cls(sums=sums.astype(np.float64), side=side, reference=reference)
-
-    def wider(self) -> BlockTable:
-        """Return the table over blocks that grow with the elements: what these cannot follow is alike over them."""
-        number = block_number(self.reference.pixels, self.reference.mesh.size, self.reference.constants)
-        padding = (-size % number for size in self.sums.shape[-2:])
-        padded = np.pad(self.sums, [(0, 0), (0, 0), *((0, more) for more in padding)])
-        rows, columns = (size // number for size in padded.shape[-2:])
-        sums = padded.reshape(*padded.shape[:2], rows, number, columns, number).sum(axis=(3, 5))
-        return replace(self, sums=sums, side=self.side * number)
 
     def together(self) -> BlockTable:
         """Return the table of all lights as one, whose pixels are those of the light that shows most of a block."""

@@ -7,7 +7,7 @@ motions of the lights. They are factorised once a pass; each iteration solves fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -278,12 +278,15 @@ class Estimate:
         Motion of each node in every iteration, px.
     longest : float
         Largest motion of a textured node, or by a light's rigid motion, in the last iteration, px.
+    has_settled
+        Every textured node did at the end of the iteration, to what it asks for.
     """
 
     displacement: FloatArray
     rigid: FloatArray
     increments: tuple[FloatArray, ...] = ()
     longest: float = float("inf")
+    has_settled: bool = False
 
     def history(self, nodes: BoolArray | slice = slice(None)) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""
@@ -311,7 +314,7 @@ def compare(problem: Problem, estimate: Estimate, reference: Reference | None = 
 def iterate(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than the tolerance, or those that do do not settle.
 
-    Where the first step is long, a fiftieth of it is enough: the weights change with the solution (an inexact Newton
+    Where the first step is long, 3 % of it is enough: the weights change with the solution (an inexact Newton
     method: Dembo, Eisenstat and Steihaug, SIAM J. Numer. Anal. 19, 1982).
 
     Parameters
@@ -347,7 +350,7 @@ def iterate(problem: Problem, equations: Equations, residual: Residual, estimate
         # from half of a step that the next one takes back each halves the error no longer
         swing = float((motion * last_motion).sum()) / max(float((last_motion**2).sum()), 1e-30)
         relaxation /= 1 - swing if swing < -0.5 else 1
-    return estimate
+    return replace(estimate, has_settled=longest <= tolerance)
 
 
 def gauss_newton_step(

@@ -32,7 +32,7 @@ def with_consistent_gradient(residual: Residual, weights: FloatImage) -> Referen
     texture, constants = reference.texture, reference.constants
     if len(weights) < 3 or not texture.mean_fraction.any():
         return reference
-    table = BlockTable.of(residual, weights, texture.images - reference.gradient)
+    table = BlockTable.of(residual, weights, gradient=texture.images - reference.gradient)
     displacement, variance, _ = table.displacement(constants.bias_range)
     excess = np.maximum((displacement**2).sum(axis=1) - 2 * variance, 0)
     consistency = 1 / (1 + excess / constants.half_weight_displacement**2)

@@ -154,7 +154,7 @@ class Residual:
         ndarray, shape (P,), float32
         """
         mean, texture = replace(self, difference=difference[None]), self.reference.texture.texture[:, None]
-        table = BlockTable.of(mean, weight[None], texture)
+        table = BlockTable.of(mean, weight[None], gradient=texture)
         xx, _, yy = table.design_effect()[0]
         # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
         fraction = np.maximum(xx + yy, 0.01)

@@ -108,12 +108,14 @@ def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Est
         if np.sqrt((motion**2).mean()) <= constants.reweight_motion:
             residual = compare(problem, estimate, last.residual.reference)
             matched = last.matched & matching_elements(residual, displacement, last.precision)
+            matched = _held_elements(problem, last, equations, estimate, residual, matched)
             return replace(last, residual=residual, matched=matched)
     residual = compare(problem, estimate, problem.reference.filtered_as(displacement))
     # of the residual that the displacement minimises: by other grey levels it is not yet the best
     minimised = residual.with_values(last.residual.reference.values)
     precision = None if problem.method is None else problem.method.precision(minimised)
     matched = matching_elements(residual, displacement, precision)
+    matched = _held_elements(problem, last, equations, estimate, residual, matched)
     weighting = Weighting(residual=residual, matched=matched, precision=precision, learnt_at=displacement)
     adapted = with_consistent_gradient(residual, weighting.weights())
     if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
@@ -123,6 +125,26 @@ def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Est
     residual = compare(problem, estimate, narrow)
     precision = None if problem.method is None else problem.method.precision(residual)
     return replace(weighting, residual=residual, precision=precision)
+
+
+def _held_elements(
+    problem: Problem,
+    last: Weighting,
+    equations: Equations,
+    estimate: Estimate,
+    residual: Residual,
+    matched: BoolArray,
+) -> BoolArray:
+    """Return the matched elements (E,) less those with a node that the images do not hold, where some may have none.
+
+    A one-sided texture does not hold a node either, but matches.
+    """
+    if matched.all() and estimate.has_settled:
+        return matched
+    table = BlockTable.of(residual, equations.weights, wide=True).together()
+    std = standard_uncertainty(residual, table, equations, last.precision)
+    lost = (std.max(axis=1) > problem.constants.max_std) & ~one_sided_texture(equations, residual)
+    return np.asarray(matched & ~lost[problem.reference.mesh.elements].any(axis=1))
 
 
 def solve(
@@ -268,8 +290,7 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
     recovery = Recovery.over(reference.material, active, equations.information(reference))
     fitted = estimate.displacement
     residual = weighting.residual.subtract_curvature(*map(equations.turned_back, recovery.offset_and_curvature(fitted)))
-    lights = BlockTable.of(residual, equations.weights)
-    table = lights.wider().together()
+    table = BlockTable.of(residual, equations.weights, wide=True).together()
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
         step = recovery.value @ gradient_step(weighting.residual, equations)
@@ -277,7 +298,7 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
         std = std * np.hypot(1, excess)[:, None]
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        bias, bias_std = light_bias(lights, equations)
+        bias, bias_std = light_bias(BlockTable.of(residual, equations.weights), equations)
     sensitivity = table.sensitivity(mesh.nodes)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale

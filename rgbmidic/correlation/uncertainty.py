@@ -75,7 +75,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     if lost.ndim:
         lost = np.repeat(lost, np.diff(pixels.offsets))
     full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
-    table = BlockTable.of(replace(residual, difference=full_difference), weights).wider()
+    table = BlockTable.of(replace(residual, difference=full_difference), weights, wide=True)
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
     roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
@@ -248,7 +248,7 @@ def excess_over_chance(
         Of the solve.
     """
     reference = table.reference
-    images = BlockTable.of(residual, weights, reference.texture.images).wider().together()
+    images = BlockTable.of(residual, weights, gradient=reference.texture.images, wide=True).together()
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
         (images.sums - table.sums[:, :4])[0, :2]
     )
