@@ -80,7 +80,7 @@ def probes(quick: bool) -> Iterator[Row]:
         for histories in zip(*read, strict=True):
             name = histories[0].name.removeprefix(f"{kind}_{number}_")
             # directions and invariants mean nothing without strain, a gauge's strain is its extension over its length
-            if histories[0].unit == "deg" or name in ("e1", "e2", "equivalent", "strain"):
+            if histories[0].unit == "deg" or name in ("e1", "e2", "shear", "equivalent", "strain"):
                 continue
             error, std = (np.stack([getattr(one, part) for one in histories]) for part in ("values", "std"))
             change = (error[:, 1] - error[:, 0]) / difference_std(std[:, 0], std[:, 1], reference_fraction(1))

@@ -161,7 +161,7 @@ def comparison(quick: bool) -> Iterator[dict[str, object]]:
             yield {"simulation": text, "quantity": name, "rms/stated": chi**0.5, "chi-square": chi}
 
 
-@table("comparison_scale", page="how-to/compare", cost=7, seed=1)
+@table("comparison_scale", page="how-to/compare", cost=7, keys=1, seed=1)
 def comparison_scale(quick: bool) -> Iterator[dict[str, object]]:
     """The same with a modulus 3 % too large, four textures: scale that fits best, mean of the pairs, its stated
     uncertainty for one pair, rms((found - 1.03) / stated), chi-square of the rest; rms over stated of the levelled

@@ -63,12 +63,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
-        (
-            "difference of states",
-            owned,
-            20,
-            lambda: compare_states(*states, *there, reference.pixels.offsets, *outputs),
-        ),
+        ("comparison of states", owned, 20, lambda: compare_states(*states, *there, *outputs)),
         ("right-hand side", owned, 24, lambda: reference.projected(weights, difference, reference.gradient)),
         ("Hessian", owned, 20, lambda: reference.hessians(weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),

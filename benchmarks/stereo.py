@@ -13,7 +13,6 @@ from rgbmidic import Tri3Mesh, read_frame, separate
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.results import Result
 from rgbmidic.tools.lab.virtual import Scene, State, record, render, sphere_scene, turned
 from rgbmidic.tools.lab.virtual.dataset import true_calibration, write_frame
 from rgbmidic.tools.lab.virtual.view_point import ViewPoint, true_motion, true_pair
@@ -97,7 +96,7 @@ def rows_of(scene: Scene, states: dict[str, State], folder: Path, camera: Path) 
     result = measure_stereo(*tests, camera, folder / "result", StereoSettings(gauge=GAUGE), workers=1)
     pixels = np.stack([result["x_left"], result["y_left"]], axis=1)
     inner = ~Tri3Mesh(nodes=pixels, elements=result.elements).on_boundary
-    first = Result.open(result.attributes["left"])
+    first = result.camera("left")
     count = int((~Tri3Mesh(nodes=first.nodes, elements=first.elements).on_boundary).sum())
     turn, origin = (result.attributes[name] for name in ("axes_rotation", "axes_origin_mm"))
     left, _ = views(scene)

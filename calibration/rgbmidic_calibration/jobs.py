@@ -281,7 +281,7 @@ def find_view_pairs(
                 f"{1e-9 * delays.min():.3g} s apart"
             )
         if alone := len(nearest) - len(indices):
-            reasons.append(f"{alone} photographs of --left have none of --right that was taken at the same time")
+            reasons.append(f"{alone} photographs of the left camera have none of the right one taken at the same time")
     for numbers in indices:
         try:
             views = [

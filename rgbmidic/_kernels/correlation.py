@@ -22,8 +22,7 @@ _ZERO = np.float32(0.0)
 _LEVEL = np.float32(1e-7)
 """Drift (px per pixel) under which a run stays between two rows: 100 pixels then drift by what float32 resolves."""
 BLOCK = 8
-"""Side (px) of the blocks for each of which `warped_weights` knows whether all weights are 1: eight bytes, compared at
-once."""
+"""Side (px) of the blocks that `find_changed_weights` looks up, all weights 1 or not: eight bytes, compared at once."""
 _NEVER = np.float32(1e9)
 
 

@@ -182,7 +182,7 @@ def test_the_command_calibrates_checks_and_shows(photographs, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "--left has 8 photographs, --right 6"),
+        (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "has 8 photographs, the right 6"),
         (["stereo", *options("views", **{"--right": "none/*.tif"})], "right: "),
         (["stereo", *options("check")], "5 simultaneous views of the target at least"),
         (["stereo", *options("views"), "--left-calibration", "a.json"], "belong together"),
@@ -216,7 +216,7 @@ def test_photographs_with_times_are_paired_by_them(photographs, monkeypatch):
     pairs, reasons = jobs.find_view_pairs((files[0], files[1]), TARGET)
     assert [pair.right.name for pair in pairs] == [files[1].series.name(index) for index in range(6)]
     assert [pair.left.name for pair in pairs] == [files[0].series.name(index) for index in range(2, 8)]
-    assert reasons == ("2 photographs of --left have none of --right that was taken at the same time",)
+    assert reasons == ("2 photographs of the left camera have none of the right one taken at the same time",)
     late["right"] = 50
     with pytest.raises(CalibrationError, match="the nearest are 43 s apart"):
         jobs.find_view_pairs((files[0], files[1]), TARGET)
