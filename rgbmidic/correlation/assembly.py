@@ -26,7 +26,7 @@ from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.elimination import Elimination
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.mesh import PixelMap, Tri3Mesh
-from rgbmidic.mesh.pixel_map import window_sums
+from rgbmidic.mesh.pixel_map import window_means
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -340,7 +340,7 @@ def mean_residual_leverage(
     limits = np.array([side * rows, side * columns]) - 1
     row, column = (np.clip(mesh.nodes[:, ::-1] - (first_row, first_column), 0, limits) // side).astype(int).T
     block_sums = [np.bincount(row * columns + column, values, rows * columns) for values in (fitted, nodal_texture)]
-    smoothed_grids = window_sums(np.reshape(block_sums, (2, rows, columns)), constants.score_range / side)
+    smoothed_grids = window_means(np.reshape(block_sums, (2, rows, columns)), constants.score_range / side)
     centre = mesh.centres[:, ::-1] - (first_row, first_column)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     local_texture = np.maximum(smoothed_grids[1][row, column], np.finfo(float).tiny)

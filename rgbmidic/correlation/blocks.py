@@ -1,8 +1,8 @@
 """The table of blocks of a comparison: what each light's residual shows, summed over squares of pixels.
 
-Whatever a frame states beyond its solution is a function of this one table. A pixel's score ``w r grad f`` is
-correlated over the reach of filters, demosaicing and speckle, and between the lights; the variance of its sum over
-blocks wider than that reach holds all of it (the block estimator of the long-run variance).
+A pixel's score is ``w r h``, with the weight w, the residual r and the gradient h of the equation that is solved (docs:
+how it works). It is correlated over the reach of filters, demosaicing and speckle, and between the lights; the variance
+of its sum over blocks wider than that reach holds all of it (the block estimator of the long-run variance).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from rgbmidic._kernels.owned_pixels import score_sums
 from rgbmidic.correlation.assembly import block_side
 from rgbmidic.correlation.reference import Reference
-from rgbmidic.mesh.pixel_map import window_sums
+from rgbmidic.mesh.pixel_map import window_means
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
@@ -30,8 +30,9 @@ class BlockTable:
     Attributes
     ----------
     sums : ndarray, shape (k, 6, h, w)
-        Scores ``w r grad f`` in x and y, their information ``w |grad f|^2`` in both, and the number of pixels with
-        weight; then ``w grad f . grad`` of the grey levels of the reference and of the deformed image.
+        Scores ``w r h`` in x and y, their information ``w |h|^2`` in both, and the number of pixels with
+        weight; then ``w h . grad`` of the grey levels of the reference and of the deformed image, but for a gradient
+        that is not the solve's.
     side : int
         Of the blocks, px.
     reference
@@ -85,11 +86,11 @@ class BlockTable:
             Mean over the window, of each direction.
         """
         score, axis_information = self.sums[:, :2], self.sums[:, 2] / 2
-        information = np.maximum(window_sums(axis_information, range_ / self.side), 1e-30)
-        displacement = window_sums(score, range_ / self.side) / information[:, None]
+        information = np.maximum(window_means(axis_information, range_ / self.side), 1e-30)
+        displacement = window_means(score, range_ / self.side) / information[:, None]
         blocks = 4 * np.pi * (range_ / self.side) ** 2  # that a window holds
         square = ((score - displacement * axis_information[:, None]) ** 2).mean(axis=1)
-        mean_square = window_sums(square, self.reference.constants.bias_range / self.side)
+        mean_square = window_means(square, self.reference.constants.bias_range / self.side)
         return displacement, mean_square / information**2 / blocks, information
 
     def design_effect(self) -> FloatArray:
@@ -102,13 +103,13 @@ class BlockTable:
         prior = constants.prior_blocks * self.side**2
         window = 4 * np.pi * (constants.score_range / self.side) ** 2
         scores, counts = self._relative(self.sums[:, :2]), self.sums[:, 3]
-        pixel_counts = self.windowed_sums(counts)
+        pixel_counts = self.windowed_means(counts)
         # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large;
         # of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
         number = np.minimum(window * pixel_counts, counts.sum(axis=(1, 2), keepdims=True)) / self.side**2
         small_sample_factor = number / np.maximum(number - 1, 0.25)
         typical = prior * np.multiply.outer(_typical_squares(scores, counts), [1.0, 0.0, 1.0])[:, :, None, None]
-        products = self.windowed_sums(scores[:, [0, 0, 1]] * scores[:, [0, 1, 1]])
+        products = self.windowed_means(scores[:, [0, 0, 1]] * scores[:, [0, 1, 1]])
         effects = (products + typical) / (pixel_counts + prior)[:, None] * small_sample_factor[:, None]
         return np.asarray(effects)
 
@@ -120,7 +121,7 @@ class BlockTable:
         a, b = np.indices((len(counts), len(counts)))
         common = (counts[a] > 0) & (counts[b] > 0)
         along, first, second = (
-            self.windowed_sums(common * (scores[i] * scores[j]).sum(axis=2)) for i, j in ((a, b), (a, a), (b, b))
+            self.windowed_means(common * (scores[i] * scores[j]).sum(axis=2)) for i, j in ((a, b), (a, a), (b, b))
         )
         scale = np.sqrt((first + typical[a]) * (second + typical[b]))
         return np.asarray(np.divide(along, scale, out=np.zeros_like(along), where=scale > 0))
@@ -131,12 +132,12 @@ class BlockTable:
         Where glare or paint has changed since, the deformed image shows less of it. 1 where there is no texture.
         """
         smoothing = self.reference.constants.information_smoothing
-        reference, deformed = self.at(np.stack([window_sums(grid, smoothing) for grid in self.sums[0, 4:]]), points)
+        reference, deformed = self.at(np.stack([window_means(grid, smoothing) for grid in self.sums[0, 4:]]), points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
-    def windowed_sums(self, grids: AnyArray) -> AnyArray:
-        """Sums of grids (..., h, w) over the window in which scores are averaged, up to a factor."""
-        return window_sums(grids, self.reference.constants.score_range / self.side)
+    def windowed_means(self, grids: AnyArray) -> AnyArray:
+        """Means of grids (..., h, w) over the window in which scores are averaged."""
+        return window_means(grids, self.reference.constants.score_range / self.side)
 
     def typical_ratio(self, scores: FloatArray) -> float:
         """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
@@ -152,7 +153,7 @@ class BlockTable:
         smooth, and averaged, is its ratio to the information.
         """
         counts = self.sums[:, 3]
-        information, pixels = window_sums(self.sums[:, 2:4], self.reference.constants.information_smoothing).swapaxes(
+        information, pixels = window_means(self.sums[:, 2:4], self.reference.constants.information_smoothing).swapaxes(
             0, 1
         )
         level = information / np.maximum(pixels, 1e-6)

@@ -17,7 +17,7 @@ import numpy as np
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.images import centred_products
 from rgbmidic.mesh import PixelMap
-from rgbmidic.mesh.pixel_map import SlidingWindow, window_sums
+from rgbmidic.mesh.pixel_map import SlidingWindow, window_means
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 BrightnessModel = float | Literal["auto", "constant", "none"]
@@ -277,4 +277,4 @@ def window_width(
 
     # over the region at first, in which shading counts as speckle
     sigma = width([grid.sum(axis=(1, 2))[:, None] for grid in grids])
-    return width([np.stack([window_sums(one, sigma / step) for one in grid]) for grid in grids])
+    return width([np.stack([window_means(one, sigma / step) for one in grid]) for grid in grids])

@@ -56,7 +56,7 @@ class Weighting:
     precision
         Of the lights; None: not learnt.
     learnt_at : ndarray, shape (N, 2)
-        Displacement at which the precision was learnt, px; None: it was not.
+        Displacement at which precision and grey levels of the reference were learnt, px; None: not yet.
     """
 
     residual: Residual

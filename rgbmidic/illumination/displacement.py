@@ -169,11 +169,11 @@ def light_displacement(
     sums = np.empty((count, 3, *slope.shape[1:]), dtype=np.float32)
     displacement_scores(moments.lights, scale, CELLS, sums)
     blocks = window / BLOCK
-    window_sums = np.array(
+    window_means = np.array(
         [[_window_sums(grid, blocks) for grid in light_sums] for light_sums in sums], dtype=np.float64
     )
-    information = window_sums[:, 2:] + 1e-12
-    estimate = window_sums[:, :2] / information
+    information = window_means[:, 2:] + 1e-12
+    estimate = window_means[:, :2] / information
     # by the scatter of the blocks' scores, which are nearly independent
     scatter = ((sums[:, :2] - estimate * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
     chance = np.array([_window_sums(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)

@@ -292,12 +292,12 @@ def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
     owner[rim] = element_of_label[label[rim]]
 
 
-def window_sums(grids: AnyArray, sigma: float) -> AnyArray:
-    """Sum grids (..., h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grids there is nothing."""
-    sums = np.empty(grids.shape, grids.dtype)  # whose grids are contiguous, whatever those given are
+def window_means(grids: AnyArray, sigma: float) -> AnyArray:
+    """Average grids (..., h, w) over a Gaussian window of `sigma` blocks; beyond them there is 0."""
+    means = np.empty(grids.shape, grids.dtype)  # whose grids are contiguous, whatever those given are
     for index in np.ndindex(grids.shape[:-2]):
-        cv2.GaussianBlur(grids[index], (0, 0), sigma, dst=sums[index], borderType=cv2.BORDER_CONSTANT)
-    return sums
+        cv2.GaussianBlur(grids[index], (0, 0), sigma, dst=means[index], borderType=cv2.BORDER_CONSTANT)
+    return means
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -338,7 +338,7 @@ class SlidingWindow:
     def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
         """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
         sigma = self.sigma / self.step
-        means, weight_means = (window_sums(grids, sigma) for grids in (totals, weights))
+        means, weight_means = (window_means(grids, sigma) for grids in (totals, weights))
         means /= np.maximum(weight_means, np.float32(1e-6), out=weight_means)
         return np.asarray(means, dtype=np.float32)
 
