@@ -78,9 +78,9 @@ class SolverConstants:
     min_block_side
         Side (px) of the blocks of the table: wider than a speckle and any filter.
     block_side_per_element
-        Side, in sides of an element, of the squares of blocks that are taken together where the elements are large:
-        what these cannot follow is alike over about that. With 13 px the error of 40 px elements on waves of 3 to 5
-        elements was 1.5 to 2.3 times the stated one, with 30 px 0.8 to 1.2 times (DIC Challenge).
+        Side of a wide block in sides of an element: what elements cannot follow is alike over about that. With 13 px
+        the error of 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, with 30 px 0.8 to
+        1.2 times (DIC Challenge).
     score_range
         Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to
         12 % (derived). With half or twice of it lights differ by 1e-3 px at most, beside a gap by 2e-3, their

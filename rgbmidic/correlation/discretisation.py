@@ -296,7 +296,7 @@ class _RefinedMesh:
 
     def recovery(self, active: BoolArray, equations: Equations) -> Recovery:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
-        return Recovery.over(self.fine.material, active, equations.information(self.fine), len(self.mesh.nodes))
+        return Recovery.over(self.fine.material, active, equations.information(), len(self.mesh.nodes))
 
     def without_curvature(
         self, residual: Residual, equations: Equations, recovery: Recovery, fitted: FloatArray
@@ -416,7 +416,7 @@ def _simulate_noise(refined: _RefinedMesh, reference: Reference) -> _NoiseStatis
         for state in (fine, reference)
     )
     everywhere = np.ones(len(mesh.elements), dtype=bool)
-    recovery = Recovery.over(reference.material, everywhere, coarse.information(reference))
+    recovery = Recovery.over(reference.material, everywhere, coarse.information())
     fine_recovery = refined.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
     scores = _scores(finer, random)
     right = np.stack([fine.assembly.vector(score) for score in scores], axis=1)

@@ -153,9 +153,9 @@ class Equations:
         """Nodes (N,) that see enough texture."""
         return np.asarray(self.observability > 1)
 
-    def information(self, reference: Reference) -> FloatArray:
+    def information(self) -> FloatArray:
         """Return texture times weight around each node, over its area, (N,): proportional to the inverse variance."""
-        return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / reference.assembly.nodal_area)
+        return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / self.reference.assembly.nodal_area)
 
     def increment(
         self, right_side: FloatArray, held_side: FloatArray, rigid_side: FloatArray
@@ -182,11 +182,11 @@ class Equations:
             motion = motion - self.rigid.response @ rigid
         return self.turned(motion.reshape(-1, 2)), rigid
 
-    def held_side(self, reference: Reference, displacement: FloatArray) -> FloatArray:
+    def held_side(self, displacement: FloatArray) -> FloatArray:
         """Right-hand side (2 N,) of the smoothness: at nodes without texture, by what is not affine around them."""
         out = np.zeros_like(displacement)
         if not self.textured.all():
-            smoothness, nodes = reference.assembly.smoothness, reference.mesh.nodes
+            smoothness, nodes = self.reference.assembly.smoothness, self.reference.mesh.nodes
             bend, at_border = ((smoothness @ field.ravel()).reshape(-1, 2) for field in (displacement, nodes))
             bend -= np.einsum("nij,nj->ni", self.gradient(displacement), at_border)
             out = np.where(self.textured[:, None], out, -self.smoothness * self.turned_back(bend))
@@ -388,8 +388,8 @@ def _right_sides(
     estimate_difference: FloatImage | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
-    reference, assembly, weights = equations.reference, problem.reference.assembly, equations.weights
-    held = equations.held_side(reference, estimate.displacement)
+    reference, assembly, weights = equations.reference, equations.reference.assembly, equations.weights
+    held = equations.held_side(estimate.displacement)
     if estimate_difference is not None:
         projected = reference.projected(weights, estimate_difference, reference.gradient)
     else:
@@ -407,6 +407,6 @@ def _right_sides(
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:
     """Displacement (N, 2) of every light: the common one and its own rigid motion."""
-    if not problem.functions.size:
+    if not problem.functions.size:  # one array, by which `Reference.warps` knows that they move alike
         return [estimate.displacement] * len(estimate.rigid)
     return [estimate.displacement + (problem.functions @ rigid).reshape(-1, 2) for rigid in estimate.rigid]

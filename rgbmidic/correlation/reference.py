@@ -392,20 +392,6 @@ class Reference(Derivable):
         """Standard deviation (px) of the window of the gain; None where the gain is one number."""
         return None if self.gain_fit is None else self.gain_fit.sigma
 
-    def channel_specific(self, light: int) -> FloatImage:
-        """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
-
-        Parameters
-        ----------
-        light
-            Index of the light.
-
-        Returns
-        -------
-        ndarray, shape (2, P), float32
-        """
-        return self.texture.images[:, light] - self.gradient[:, light]
-
     def filtered_as(self, displacement: FloatArray) -> Reference:
         """Return the reference with the grey levels that the prefilter leaves of it where it is deformed.
 

@@ -287,7 +287,7 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
     reference, mesh = weighting.residual.reference, problem.reference.mesh
     active = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(reference.material, active, equations.information(reference))
+    recovery = Recovery.over(reference.material, active, equations.information())
     fitted = estimate.displacement
     residual = weighting.residual.subtract_curvature(*map(equations.turned_back, recovery.offset_and_curvature(fitted)))
     table = BlockTable.of(residual, equations.weights, wide=True).together()

@@ -140,7 +140,7 @@ class Shape:
         Returns
         -------
         dict
-            Quantities of `rgbmidic.tools.stereo.result.QUANTITIES` that a frame has, by name.
+            Quantities of `rgbmidic.tools.stereo.stereo_file.QUANTITIES` that a frame has, by name.
         """
         displacements, stds, biases = (
             [np.stack([side[f"u{end}"], side[f"v{end}"]], axis=1, dtype=np.float64) for side in (left, right)]

@@ -123,7 +123,10 @@ class SurfaceInUnits(ResultInUnits):
         attributes = self.result.stereo.attributes
         yield f"u, v, w are along the axes {attributes['axes']}; lengths are those in space"
         yield "places are in px of the left camera's reference; a scale in mm per px is the mean over the surface"
-        yield f"the calibration leaves {100 * float(attributes['relative_length_std']):.2g} % of every length"
+        relative = float(attributes["relative_length_std"])
+        yield f"the calibration leaves {100 * relative:.2g} % of every length"
+        if relative:
+            yield "strain over a gauge is stated without what the calibration leaves of it; that of the file has it"
 
     @cached_property
     def quantities(self) -> dict[str, ResultQuantity]:

@@ -151,7 +151,7 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     inner = equations.textured & ~mesh.adjacent_nodes(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
     used = equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(mesh, used, equations.information(reference))
+    recovery = Recovery.over(mesh, used, equations.information())
     strain, hessian = recovery.strain_functionals, reference.assembly.matrix(equations.blocks)
     probed = functional_std(equations.solve, hessian, reference.material, [(one, inner) for one in strain])
     for number, functional in enumerate(strain):

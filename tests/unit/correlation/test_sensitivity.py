@@ -93,7 +93,7 @@ def test_lost_nodes_take_nothing_from_the_uncertainty_of_those_probed_with_them(
     seen = reference.pixels.gather(weights[0])[None]
     equations = Equations.build(reference, seen, np.zeros((2 * len(mesh.nodes), 0)), 0 * mesh.nodes)
     nodes = equations.observability > USUAL.min_information / USUAL.min_texture
-    recovery = Recovery.over(mesh, nodes[mesh.elements].all(axis=1), equations.information(reference))
+    recovery = Recovery.over(mesh, nodes[mesh.elements].all(axis=1), equations.information())
     few = reference.sums(seen, seen[0])[0, :, 0] < 25
     scores = (
         10 * reference.inverse_level.mean() ** 2 * equations.blocks * np.where(few, variance, 1)[:, None, None, None]
