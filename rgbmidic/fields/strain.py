@@ -569,8 +569,7 @@ class StrainGauges:
         """
         matrices = self.slopes if measured.all() else self._matrices(self.weights(measured))
         flat = np.where(measured[:, None], values.reshape(len(values), -1), 0.0)
-        slopes = np.stack([slope @ flat for slope in matrices], axis=-1)
-        return np.asarray(slopes.reshape(len(slopes), *values.shape[1:], 2))
+        return _slopes(matrices, flat).reshape(-1, *values.shape[1:], 2)
 
     def slopes_of(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
         """Fit the planes to each component of the displacements of one frame.
@@ -592,7 +591,7 @@ class StrainGauges:
         matrices = self.slopes if measured.all() else self._matrices(weights)
         arrays = displacement.values, displacement.bias_std, displacement.error_factor
         values, bias, factor = (np.where(measured, array, 0.0) for array in arrays)
-        gradient = np.stack([np.stack([slope @ one for slope in matrices], axis=1) for one in values], axis=1)
+        gradient = _slopes(matrices, values.T)
         spread, products = np.zeros((len(gradient), count, 2, count, 2)), weights[[0, 1, 0]] * weights[[0, 1, 1]]
         for i, j in combinations_with_replacement(range(count), 2):
             square = (factor[i] * factor[j]).sum(axis=0)
@@ -653,6 +652,11 @@ class StrainGauges:
     def _sum(self, values: AnyArray) -> FloatArray:
         sums = np.bincount(self.rows, weights=values, minlength=len(self.centres))
         return np.asarray(sums, dtype=np.float64)
+
+
+def _slopes(matrices: list[sp.csr_matrix], values: FloatArray) -> FloatArray:
+    """Slopes (G, c, 2) of nodal values (n, c) along x and y."""
+    return np.stack([slope @ values for slope in matrices], axis=-1)
 
 
 def _products(first: sp.csr_matrix, second: sp.csr_matrix) -> FloatArray:
