@@ -168,19 +168,16 @@ class FieldMovie:
         """Panels and their limits (px) along x and y, from all frames or evenly spaced ones."""
         maps, result, panels, corners = self.maps, self.maps.result, [], [self.maps.result.nodes]
         frames = select_evenly(self.frame_indices, max(2, self.constants.sample_size // len(result.nodes)))
+        for frame in frames if self.images is not None else ():
+            deformed = maps.deformed_nodes(frame)
+            deformed = deformed[np.isfinite(deformed).all(axis=1)]
+            if len(deformed):
+                corners += [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
         for name in self.fields:
             colour_values, field = [], maps.field(name)
             for frame in frames:
                 nodal = maps.read(name, frame)
                 colour_values.append(style.ordinary_values(nodal.values, nodal.uncertainty))
-                if self.images is not None:
-                    deformed = maps.deformed_nodes(frame)
-                    deformed = deformed[np.isfinite(deformed).all(axis=1)]
-                    corners += (
-                        [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
-                        if len(deformed)
-                        else []
-                    )
             finite_values = np.concatenate(colour_values)
             if not finite_values.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")

@@ -50,7 +50,7 @@ class ImageWindow:
 
     def fit_aspect(self) -> ImageWindow:
         """Widen the window to as many screen pixels per px in both directions, about the same centre."""
-        step = max((self.x_max - self.x_min) / self.width, (self.y_max - self.y_min) / self.height)
+        step = max(self.steps)
         x, y = (self.x_min + self.x_max) / 2, (self.y_min + self.y_max) / 2
         half_x, half_y = step * self.width / 2, step * self.height / 2
         return replace(self, x_min=x - half_x, y_min=y - half_y, x_max=x + half_x, y_max=y + half_y)
