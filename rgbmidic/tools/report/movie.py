@@ -347,16 +347,8 @@ class _Canvas:
         nodes = result.nodes if movie.images is None else movie.maps.deformed_nodes(frame)
         for box, panel in zip(self.boxes, self._panels, strict=True):
             values = movie.maps.read(panel.field.name, frame).values
-            vertices, elements = movie.maps.triangulate(panel.field, np.column_stack([nodes, values]))
-            overlay = Overlay(
-                nodes=vertices[:, :2],
-                elements=elements,
-                values=np.ascontiguousarray(vertices[:, 2]),
-                colour_range=panel.colour_range,
-                colours=palette(panel.colours),
-                opacity=movie.opacity,
-                stepped=panel.field.stepped,
-            )
+            look = {"colour_range": panel.colour_range, "colours": palette(panel.colours), "opacity": movie.opacity}
+            overlay = Overlay.of_field(movie.maps, panel.field, nodes, values, **look)
             page[box] = paint(self.window, picture, overlay, OUTSIDE_GREY[False])
         return page.view(np.uint8).reshape(*page.shape, 4)
 

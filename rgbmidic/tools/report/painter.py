@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.results import Result
+from rgbmidic.results import Maps, Result, ResultQuantity
 from rgbmidic.tools.report.style import STATUS_COLOURS
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -103,6 +104,13 @@ class Overlay:
     opacity: float = 1.0
     stepped: bool = False
     hatch_margin: FloatArray | None = None
+
+    @classmethod
+    def of_field(cls, maps: Maps, field: ResultQuantity, nodes: FloatArray, values: FloatArray, **look: Any) -> Self:
+        """Return a field with values (N,) at nodes (N, 2), in the triangles of `Maps.triangulate`, and its look."""
+        vertices, elements = maps.triangulate(field, np.column_stack([nodes, values]))
+        positions, corner_values = vertices[:, :2], np.ascontiguousarray(vertices[:, 2])
+        return cls(nodes=positions, elements=elements, values=corner_values, stepped=field.stepped, **look)
 
 
 def paint(window: ImageWindow, picture: AnyArray, overlay: Overlay | None = None, outside_grey: int = 40) -> Pixels:
