@@ -34,9 +34,9 @@ def read_nastran(path: Path) -> MeshContent:
                 nodes.append((parse_whole(label), [parse_real(x) for x in position]))
         elif (shape := _SHAPES.get(name)) is not None:
             label, property_, *corners = fields
-            nodes_of_element = [parse_whole(node) for node in corners[: CORNERS[shape]]]
-            elements.append((shape, parse_whole(label), nodes_of_element))
-            sets.setdefault(property_ or label, []).append(parse_whole(label))
+            element_nodes, number = [parse_whole(node) for node in corners[: CORNERS[shape]]], parse_whole(label)
+            elements.append((shape, number, element_nodes))
+            sets.setdefault(property_ or label, []).append(number)
         elif name.startswith("C") and not name.startswith("CORD"):
             unread.add(name)
     return MeshContent.from_labels(nodes, elements, sets, unread)

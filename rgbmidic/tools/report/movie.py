@@ -168,19 +168,16 @@ class FieldMovie:
         """Panels and their limits (px) along x and y, from all frames or evenly spaced ones."""
         maps, result, panels, corners = self.maps, self.maps.result, [], [self.maps.result.nodes]
         frames = select_evenly(self.frame_indices, max(2, self.constants.sample_size // len(result.nodes)))
+        for frame in frames if self.images is not None else ():
+            deformed = maps.deformed_nodes(frame)
+            deformed = deformed[np.isfinite(deformed).all(axis=1)]
+            if len(deformed):
+                corners += [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
         for name in self.fields:
             colour_values, field = [], maps.field(name)
             for frame in frames:
                 nodal = maps.read(name, frame)
                 colour_values.append(style.ordinary_values(nodal.values, nodal.uncertainty))
-                if self.images is not None:
-                    deformed = maps.deformed_nodes(frame)
-                    deformed = deformed[np.isfinite(deformed).all(axis=1)]
-                    corners += (
-                        [deformed.min(axis=0, keepdims=True), deformed.max(axis=0, keepdims=True)]
-                        if len(deformed)
-                        else []
-                    )
             finite_values = np.concatenate(colour_values)
             if not finite_values.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
@@ -350,16 +347,8 @@ class _Canvas:
         nodes = result.nodes if movie.images is None else movie.maps.deformed_nodes(frame)
         for box, panel in zip(self.boxes, self._panels, strict=True):
             values = movie.maps.read(panel.field.name, frame).values
-            vertices, elements = movie.maps.triangulate(panel.field, np.column_stack([nodes, values]))
-            overlay = Overlay(
-                nodes=vertices[:, :2],
-                elements=elements,
-                values=np.ascontiguousarray(vertices[:, 2]),
-                colour_range=panel.colour_range,
-                colours=palette(panel.colours),
-                opacity=movie.opacity,
-                stepped=panel.field.stepped,
-            )
+            look = {"colour_range": panel.colour_range, "colours": palette(panel.colours), "opacity": movie.opacity}
+            overlay = Overlay.of_field(movie.maps, panel.field, nodes, values, **look)
             page[box] = paint(self.window, picture, overlay, OUTSIDE_GREY[False])
         return page.view(np.uint8).reshape(*page.shape, 4)
 

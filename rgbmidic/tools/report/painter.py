@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.results import Result
+from rgbmidic.results import Maps, Result, ResultQuantity
 from rgbmidic.tools.report.style import STATUS_COLOURS
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -50,7 +51,7 @@ class ImageWindow:
 
     def fit_aspect(self) -> ImageWindow:
         """Widen the window to as many screen pixels per px in both directions, about the same centre."""
-        step = max((self.x_max - self.x_min) / self.width, (self.y_max - self.y_min) / self.height)
+        step = max(self.steps)
         x, y = (self.x_min + self.x_max) / 2, (self.y_min + self.y_max) / 2
         half_x, half_y = step * self.width / 2, step * self.height / 2
         return replace(self, x_min=x - half_x, y_min=y - half_y, x_max=x + half_x, y_max=y + half_y)
@@ -103,6 +104,13 @@ class Overlay:
     opacity: float = 1.0
     stepped: bool = False
     hatch_margin: FloatArray | None = None
+
+    @classmethod
+    def of_field(cls, maps: Maps, field: ResultQuantity, nodes: FloatArray, values: FloatArray, **look: Any) -> Self:
+        """Return a field with values (N,) at nodes (N, 2), in the triangles of `Maps.triangulate`, and its look."""
+        vertices, elements = maps.triangulate(field, np.column_stack([nodes, values]))
+        positions, corner_values = vertices[:, :2], np.ascontiguousarray(vertices[:, 2])
+        return cls(nodes=positions, elements=elements, values=corner_values, stepped=field.stepped, **look)
 
 
 def paint(window: ImageWindow, picture: AnyArray, overlay: Overlay | None = None, outside_grey: int = 40) -> Pixels:

@@ -187,7 +187,7 @@ class RegionDrawing:
         """Draw the lines."""
         self._redraw_pending = False
         outline, holes = rings(self.marks)
-        coloured_rings = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
+        coloured_rings = [(outline, _COLOURS[1]), *((hole, _COLOURS[0]) for hole in holes)]
         for index, light_rings in enumerate(masks_of(self.marks).values()):
             coloured_rings += [(ring, _COLOURS[2 + index % (len(_COLOURS) - 2)]) for ring in light_rings]
         closed_rings = [([*ring, *ring[:1]], colour) for ring, colour in coloured_rings]

@@ -207,23 +207,18 @@ class FieldsInView:
 
     def overlay(self, name: str) -> Overlay:
         """Return a field as it is painted; palette, range by hand and number of colours are those of the first."""
-        view, field, values, is_first = (
-            self.view,
-            self.maps.quantities[name],
-            self.values(name),
-            name == self.view.field,
-        )
+        view, field, values = self.view, self.maps.quantities[name], self.values(name)
+        is_first = name == view.field
         field_palette = palette_name(field, symmetric=view.symmetric)
-        vertices, elements = self.maps.triangulate(field, np.column_stack([self.nodes, values.values]))
         hatch_margin = (np.abs(values.values) - 2 * values.uncertainty)[:, None]
-        return Overlay(
-            nodes=vertices[:, :2],
-            elements=elements,
-            values=np.ascontiguousarray(vertices[:, 2]),
+        return Overlay.of_field(
+            self.maps,
+            field,
+            self.nodes,
+            values.values,
             colour_range=self.colour_range(name, by_hand=is_first),
             colours=palette((is_first and not field.codes and view.palette) or field_palette, view.levels),
             opacity=view.opacity,
-            stepped=field.stepped,
             hatch_margin=self.maps.triangulate(field, hatch_margin)[0][:, 0] if view.hatched else None,
         )
 

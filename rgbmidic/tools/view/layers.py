@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bokeh.models as bk
 import numpy as np
@@ -17,10 +17,6 @@ from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.fields import element_at
 from rgbmidic.tools.view.marks import SCALE, Mark, probe_marks
 from rgbmidic.typing import FloatArray
-
-if TYPE_CHECKING:
-    pass
-
 
 _SEGMENT, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
 LETTERS = {
@@ -101,7 +97,7 @@ class LabelLayer:
 
 def place_texts(texts: Sequence[tuple[float, float, str]], window: ImageWindow) -> list[tuple[str, int, int]]:
     """Return alignment and offsets of texts at (x, y) that end within a window and do not lie on each other."""
-    step = (window.x_max - window.x_min) / window.width  # px of the image to one of the screen
+    step = window.steps[0]
     placements, boxes = [], list[tuple[float, float, float]]()
     for x, y, text in texts:
         x_start, length, y_text = (

@@ -14,7 +14,7 @@ from bokeh.events import MouseMove
 
 from rgbmidic.results import frame_times
 from rgbmidic.tools.report.painter import OUTSIDE_GREY, Picture, paint, palette
-from rgbmidic.tools.report.style import BAR, add_colour_bar, draw_figure, finish_picture, literal
+from rgbmidic.tools.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, finish_picture, literal
 from rgbmidic.tools.view.canvas import Canvas
 from rgbmidic.tools.view.constants import VIEWER
 from rgbmidic.tools.view.fields import FieldsInView
@@ -206,7 +206,7 @@ class MapPanel:
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.draw_marks(view.marks, fields.result.nodes, nodes, texts, gauge)
         extremes = fields.extremes if view.extremes else ()
-        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), extremes, strict=False)
+        names = zip(("smallest", "largest"), (OKABE_ITO["sky blue"], OKABE_ITO["orange"]), extremes, strict=False)
         self._extreme_labels.show(
             [
                 (*nodes[node].tolist(), f"{name} {field.format(values.values[node], values.uncertainty[node])}", colour)
