@@ -45,10 +45,7 @@ def as_numbers(
         is_lossless = bool((array == original).all()) if array.shape == original.shape else False
     except (TypeError, ValueError, OverflowError):
         array, is_lossless = np.empty(0), False
-    shape_matches = len(array.shape) == len(shape) and all(
-        expected is None or length == expected for length, expected in zip(array.shape, shape, strict=True)
-    )
-    if not (is_lossless and shape_matches and np.isfinite(array).all()):
+    if not (is_lossless and _has_shape(array, shape) and np.isfinite(array).all()):
         raise error(f"{requirement}; given is {reprlib.repr(values)}")
     return array
 
@@ -65,14 +62,17 @@ def as_values(values: npt.ArrayLike, name: str, shape: tuple[int | None, ...], k
         array = np.asarray(values)
     except ValueError:  # rows of several lengths
         array = np.empty(0, dtype=object)
-    shape_matches = array.ndim == len(shape) and all(
-        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind not in kinds or not shape_matches:
+    if array.dtype.kind not in kinds or not _has_shape(array, shape):
         noun = "True or False" if kinds == "b" else "numbers"
         size = ", ".join("any" if length is None else str(length) for length in shape)
         raise InputError(f"{name} must be an array ({size}) of {noun}; given is {reprlib.repr(values)}")
     return array
+
+
+def _has_shape(array: AnyArray, shape: tuple[int | None, ...]) -> bool:
+    return array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
 
 
 def unmasked(array: npt.ArrayLike) -> AnyArray:

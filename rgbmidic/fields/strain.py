@@ -130,6 +130,10 @@ _QUANTITIES: tuple[tuple[ResultQuantity, _Function], ...] = (
 them all, in this order."""
 STRAIN: dict[str, ResultQuantity] = {entry.name: entry for entry, _ in _QUANTITIES}
 """What the quantities of a strain are, by name."""
+TENSOR = ("exx", "eyy", "exy")
+"""Names of the components of the tensor."""
+PRINCIPAL = ("e1", "e2")
+"""Names of the principal strains."""
 
 
 class Strain(dict[str, Field]):
@@ -155,12 +159,12 @@ class Strain(dict[str, Field]):
     @property
     def components(self) -> FloatArray:
         """Values of exx, eyy and exy, shape (..., 3)."""
-        return np.stack([self[name].values for name in ("exx", "eyy", "exy")], axis=-1)
+        return np.stack([self[name].values for name in TENSOR], axis=-1)
 
     @property
     def components_std(self) -> FloatArray:
         """Standard uncertainties of exx, eyy and exy, shape (..., 3)."""
-        return np.stack([self[name].uncertainty for name in ("exx", "eyy", "exy")], axis=-1)
+        return np.stack([self[name].uncertainty for name in TENSOR], axis=-1)
 
 
 def length_of(components: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -209,8 +209,8 @@ def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: 
     with stage("separation"):
         images = light_images(plan.separation, state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
-        name, shapes = plan.series.name(index), (images.values.shape, reference.images.shape)
-        raise FrameError("{} has the shape {}, the reference {}".format(name, *shapes))
+        name = plan.series.name(index)
+        raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
         grey_levels, weights = plan.prepared(images, index)
         deformed = Deformed.prepare(grey_levels, weights, prefilter=settings.solver.prefilter, origin=window.origin)

@@ -217,9 +217,7 @@ def _gauge_figures(
         size = np.abs(loaded.components)
         finite = size[np.isfinite(size)]
         largest = float(np.quantile(finite, CONSTANTS.largest)) if finite.size else float("nan")
-        noise = (
-            floor if np.isfinite(floor) else rms(np.stack([loaded[name].uncertainty for name in ("exx", "eyy", "exy")]))
-        )
+        noise = floor if np.isfinite(floor) else rms(loaded.components_std)
         yield GaugeFigures(length=length, noise=noise, largest=largest)
 
 

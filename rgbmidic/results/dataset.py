@@ -16,16 +16,15 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from rgbmidic.fields.strain import TENSOR
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
-from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES, ResultInUnits, frame_times
+from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES, ResultInUnits
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.timing import STAGES
 from rgbmidic.typing import AnyArray
 
-_COMPONENTS = ("exx", "eyy", "exy")
-"""Quantities of the field table that are the components of one variable, `strain`; likewise of their uncertainties."""
 _NUMBERED_AXES = {"brightness": ("brightness_part", ("gain", "offset")), "seconds": ("stage", tuple(STAGES))}
 """Dimension and coordinate of the axes that have a number in the field table in place of a name."""
 
@@ -77,11 +76,7 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
     plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _NUMBERED_AXES[name][0] if name in _NUMBERED_AXES else ""
-        if (
-            not entry.is_stackable
-            or entry.file_name.removesuffix("_std") in _COMPONENTS
-            or name in ("number", "time_ns")
-        ):
+        if not entry.is_stackable or entry.file_name.removesuffix("_std") in TENSOR or name in ("number", "time_ns"):
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
         is_displacement = name in DISPLACEMENT_QUANTITIES
@@ -92,7 +87,7 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
         lazy_array = _LazyArray(read, len(result), entry.unmeasured(result.table.sizes))
         variables[name] = xr.Variable(axes, indexing.LazilyIndexedArray(lazy_array), attributes)
     for suffix, long_name in {"": "strain", "_std": "standard uncertainty of strain"}.items():
-        names, note = tuple(f"{name}{suffix}" for name in _COMPONENTS), maps.processing_note("exx")
+        names, note = tuple(f"{name}{suffix}" for name in TENSOR), maps.processing_note("exx")
         attributes = {"units": "1", "long_name": long_name, "description": ": ".join(filter(None, [plane, note]))}
         blank = np.full((len(result.nodes), len(names)), np.nan, dtype=np.float32)
         lazy_array = _LazyArray(partial(_read_fields, maps, names), len(result), blank)
@@ -110,14 +105,14 @@ def _coordinates(physical: ResultInUnits) -> dict[str, xr.Variable]:
         "number": xr.Variable("frame", result.number, QUANTITIES["number"].attributes),
         "name": xr.Variable("frame", list(result.names), {"long_name": "name of the frame"}),
         "light": xr.Variable("light", list(result.lights), {"long_name": "name of the light"}),
-        "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),
+        "component": xr.Variable("component", list(TENSOR), {"long_name": "component of the strain tensor"}),
     }
     coordinates |= {dimension: xr.Variable(dimension, list(labels)) for dimension, labels in _NUMBERED_AXES.values()}
     numbers = [(SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")]
     for entry, values in [*physical.coordinates, *numbers]:
         if values is not None:
             coordinates[entry.name] = xr.Variable(entry.axes, values, entry.attributes)
-    if (times := frame_times(result, physical.scale)) is not None:
+    if (times := physical.seconds) is not None:
         attributes = {"units": "s", "long_name": "time of the frame from the trigger"}
         coordinates["time"] = xr.Variable("frame", times, attributes)
     return coordinates

@@ -26,7 +26,7 @@ from rgbmidic.fields.quantity import ResultQuantity
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.result import Result
-from rgbmidic.results.result_in_units import ResultInUnits, frame_times
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
 
@@ -255,7 +255,7 @@ def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
         for name in ("nodes", "elements", "names", "lights", *label_names):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
-        times = frame_times(result, physical.scale)
+        times = physical.seconds
         with archive.open("time_s.npy", "w") as member:
             np.lib.format.write_array(member, np.full(len(result), np.nan) if times is None else times)
         for quantity in QUANTITIES.values():

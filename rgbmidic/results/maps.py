@@ -136,12 +136,8 @@ class Maps(Portable):
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
             raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
-        if (
-            since is not None
-            and self.result.finished[since]
-            and np.isnan((base_record := self.result.frame(since)).u).all()
-        ):
-            reason = base_record.reason or "no node"
+        if since is not None and self.result.finished[since] and np.isnan((base := self.result.frame(since)).u).all():
+            reason = base.reason or "no node"
             raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
         window = window or self.result.section(ProbeSettings).window or DEFAULT_RATE_WINDOW
         rate_frames(window, FEWEST)
@@ -233,7 +229,7 @@ class Maps(Portable):
             field = Field(name=name, unit=entry.unit, dims=("node",), values=self.read(base, frame).uncertainty)
         elif entry.group == "Strain":
             field = self._strain(frame)[name]
-        elif entry.order or name == "magnitude" or name in self.physical.components:
+        elif entry.group in ("Displacement", "Rates"):
             field = self._derived(entry, frame)
         else:
             field = self._current.field(name, frame)

@@ -94,12 +94,8 @@ class Profile:
     """
 
     def __init__(self, maps: Maps, field: str, endpoints: Sequence[float], frames: Sequence[int] | AnyArray) -> None:
-        self.field, self.processing_note, result, physical = (
-            maps.field(field),
-            maps.processing_note(field),
-            maps.result,
-            maps.physical,
-        )
+        self.field, self.processing_note = maps.field(field), maps.processing_note(field)
+        result, physical = maps.result, maps.physical
         if f"{field}_std" not in maps.quantities:
             raise InputError(
                 f'a profile is of a field with an uncertainty, not of "{field}"; these are '

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.fields.quantity import ESTIMATED, ResultQuantity, with_uncertainty
-from rgbmidic.fields.strain import STRAIN
+from rgbmidic.fields.strain import PRINCIPAL, STRAIN, TENSOR
 from rgbmidic.fields.units import Units
 from rgbmidic.timing import STAGES
 
@@ -168,11 +168,10 @@ def derived_quantities(components: tuple[str, ...]) -> dict[str, ResultQuantity]
 
 DERIVED = derived_quantities(UV) | STRAIN
 """Displacement, rates of displacement and strain, and strain itself, by name."""
-_TENSOR, _PRINCIPAL, _SINGLE = (tuple(STRAIN.values())[part] for part in (slice(3), slice(3, 5), slice(5, None)))
-STRAIN_COLUMNS = (
-    *with_uncertainty(*_TENSOR),
-    *with_uncertainty(*_PRINCIPAL),
-    *(column for entry in _SINGLE for column in with_uncertainty(entry)),
+STRAIN_COLUMNS = tuple(
+    column
+    for names in (TENSOR, PRINCIPAL, *((name,) for name in STRAIN if name not in TENSOR + PRINCIPAL))
+    for column in with_uncertainty(*(STRAIN[name] for name in names))
 )
 """Strain of a frame over a gauge, in the order of exports."""
 ELEMENT_STRAIN = tuple(
@@ -182,7 +181,7 @@ ELEMENT_STRAIN = tuple(
         axes=("element",),
         description=f"{entry.description}, constant in an element",
     )
-    for entry in _TENSOR
+    for entry in map(STRAIN.__getitem__, TENSOR)
 )
 COMPONENTS = ("u", "v", "nodal_exx", "nodal_eyy", "nodal_exy")
 ERROR_QUANTITIES = {

@@ -22,7 +22,7 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.quantity import ResultQuantity
-from rgbmidic.fields.strain import MEASURES, STRAIN, StrainGauges, unchecked_strain
+from rgbmidic.fields.strain import MEASURES, STRAIN, TENSOR, StrainGauges, unchecked_strain
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.quantities import (
@@ -424,4 +424,4 @@ class ResultInUnits(Portable):
             if field.bias is not None:
                 columns[f"{field.name}_bias_std"] = field.bias
         columns |= zip(("u_edge_std", "v_edge_std"), self.length * np.asarray(edge), strict=True)
-        return columns | {f"{name}_element": in_elements[name].values for name in ("exx", "eyy", "exy")}
+        return columns | {f"{name}_element": in_elements[name].values for name in TENSOR}
