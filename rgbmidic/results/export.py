@@ -227,7 +227,7 @@ def export_result(
     Raises
     ------
     InputError
-        The format is unknown.
+        The format is unknown, or the file's ending is that of another one.
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
 
@@ -240,6 +240,8 @@ def export_result(
     out = Path(out)
     if to not in EXPORT_FORMATS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
+    if (ending := _ENDINGS.get(out.suffix.lower(), to)) != to:
+        raise InputError(f"{out} ends as a file of the format {ending}, and {to} is what is written (--to): choose one")
     check_file(out, overwrite=overwrite)
     physical = ResultInUnits.from_result(result, scale)
     if (exporter := physical.exporter) is not None:
@@ -304,5 +306,6 @@ _WRITERS: dict[str, Callable[[ResultInUnits, BinaryIO], None]] = {
     "csv": _write_csv,
     "hdf5": write_hdf5,
 }
+_ENDINGS = {".npz": "npz", ".csv": "csv", ".h5": "hdf5", ".hdf5": "hdf5", ".vtkhdf": "hdf5"}
 EXPORT_FORMATS = tuple(_WRITERS)
 """Names of the formats that `export_result` writes."""

@@ -80,6 +80,8 @@ def stereo_outlooks(plan: LampPlan, second: SecondCamera, angles: Sequence[float
     left = np.stack(pixels, axis=1)
     states = [outlook.state for outlook in plan.outlooks]
     positions = [points_and_normals(scene, material, state)[0] for state in (State(), *states)]
+    grid = np.stack([plan.x, plan.y])
+    axes = Axes.of("plane", None, positions[0][:, plan.inside].T)
     outlooks = []
     for angle in (second.angle_deg, *(angle for angle in angles if angle != second.angle_deg)):
         views = ViewPoint.both(scene, replace(second, angle_deg=angle))
@@ -93,11 +95,9 @@ def stereo_outlooks(plan: LampPlan, second: SecondCamera, angles: Sequence[float
             forecast = by.forecast(before, after, nodal_mean(trace_change(motion), radius))
             return np.asarray(np.hypot(forecast.std, forecast.bias)[plan.inside])
 
-        grid = np.stack([plan.x, plan.y])
         match = std(plan.reference, zones[0], seen[0] - grid)
         right = seen[0][:, plan.inside].T
         surface = _covariance(pair, left, right, np.zeros_like(match), match)
-        axes = Axes.of("plane", None, positions[0][:, plan.inside].T)
         shape = _rms(axes, surface)
         rows = [
             _covariance(pair, left, right, outlook.std[plan.inside], std(zones[0], after, moved - seen[0]))

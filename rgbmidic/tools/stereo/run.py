@@ -316,6 +316,15 @@ def _measure_right(test: _Test, mesh: Tri3Mesh, region: Region, out: Path, optio
 def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:
     """Refuse tests that contradict each other or the cameras."""
     left, right = tests
+    if (left.settings.frames, left.settings.region) == (right.settings.frames, right.settings.region):
+        raise InputError(
+            f"{left.name} and {right.name} name the same frames and region: each camera has frames of its own"
+        )
+    for test in tests:
+        if test.settings.scale.mm_per_pixel is not None or test.settings.scale.camera is not None:
+            logger.warning(
+                f"{test.name}: its scale in the plane does not enter, lengths in space are those of {pair.name}"
+            )
     pair.check((left.series.shape, right.series.shape))
     pair.check_lights((left.lights, right.lights))
     counts = [len(test.series.selected) for test in tests]

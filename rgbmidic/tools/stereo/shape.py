@@ -198,7 +198,7 @@ class Shape:
             yield (
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {common_std:.3f} px: "
                 f"the cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: "
-                "calibrate again (rgbmidic-calibrate stereo)"
+                "calibrate again (rgbmidic-calibrate stereo), unless LEFT and RIGHT are exchanged"
             )
         deviation = np.abs(shape.residual - np.median(shape.residual))
         scatter = np.maximum(1.4826 * np.median(deviation), shape.residual_std)

@@ -120,6 +120,8 @@ def test_existing_file_is_kept_unless_overwriting_is_allowed(result: Result, tmp
 def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) -> None:
     with pytest.raises(InputError, match='"xls"; allowed are npz, csv, hdf5'):
         export_result(result, "xls", tmp_path / "a")
+    with pytest.raises(InputError, match=r"a\.csv ends as a file of the format csv, and npz is what is written"):
+        export_result(result, "npz", tmp_path / "a.csv")
     with pytest.raises(ResultError, match="no folder"):
         export_result(result, "npz", tmp_path / "none" / "a")
     with pytest.raises(ResultError, match="already exists"):

@@ -101,7 +101,7 @@ def write_stereo_dataset(
     ConfigurationError
         The scene file is wrong.
     InputError
-        The angle is not above 0 and below 120 degrees, or the body spins during the exposure.
+        The angle is not above 0 and below 120 degrees or not that of the scene, or the body spins during the exposure.
     ResultError
         The folder is not empty or cannot be written.
     """
@@ -110,6 +110,11 @@ def write_stereo_dataset(
     experiment, out = read_scene(scene_toml), Path(out)
     second = experiment.second or SecondCamera()
     if angle_deg is not None:
+        if experiment.second is not None and angle_deg != second.angle_deg:
+            raise InputError(
+                f"{scene_toml}: camera.second.angle_deg is {second.angle_deg:g}, stated beside it are {angle_deg:g} "
+                "degrees (--stereo): state one of them"
+            )
         second = replace(second, angle_deg=angle_deg)
     scene, states = experiment.scene, (State(), *experiment.states)
     views = ViewPoint.both(scene, second)

@@ -152,6 +152,20 @@ def test_tests_that_contradict_each_other_are_refused(measured, pair, tmp_path, 
     assert not (tmp_path / "result/stereo.vtkhdf").exists()
 
 
+def test_one_camera_twice_is_refused_and_a_scale_in_the_plane_is_said_not_to_enter(measured, pair, tmp_path, caplog):
+    folder, _ = measured
+    left = folder / "left/TEST.toml"
+    with pytest.raises(InputError, match="name the same frames and region"):
+        measure_stereo(left, left, pair, tmp_path / "result")
+    shutil.copytree(folder / "right", tmp_path / "right")
+    with (tmp_path / "right/TEST.toml").open("a") as file:
+        file.write("[scale]\nmm_per_pixel = 0.1\n")
+    other = replace(pair, right=replace(pair.right, shape=(240, 320)))
+    with pytest.raises(RgbmidicError, match="calibrated with frames"):
+        measure_stereo(left, tmp_path / "right/TEST.toml", other, tmp_path / "result")
+    assert "right/TEST.toml: its scale in the plane does not enter" in caplog.text
+
+
 def test_frame_rates_and_times_that_differ_are_refused(measured, pair, tmp_path, monkeypatch):
     folder, _ = measured
     for side, rate in (("left", 100), ("right", 200)):

@@ -174,10 +174,10 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_two_cameras_see_one_test(tmp_path):
     """The true points project onto the left pixels, and the true motion onto the motion that either camera sees."""
-    second = "\n[camera.second]\nangle_deg = 30\nazimuth_deg = 70\nroll_deg = 9\nshape = [50, 70]\nfocal_px = 8000"
+    second = "\n[camera.second]\nangle_deg = 20\nazimuth_deg = 70\nroll_deg = 9\nshape = [50, 70]\nfocal_px = 8000"
     text = SMALL.format(camera="", output="").replace("samples = 3", f"samples = 1{second}")
     path = scene_file(tmp_path, text.replace("calibration_frames = 2", "calibration_frames = 1"))
-    left, right = write_stereo_dataset(path, tmp_path / "out", 20.0)
+    left, right = write_stereo_dataset(path, tmp_path / "out")
     assert read_test(right).region.rectangle == (0, 0, 69, 49)
     pair = CameraPair.read(tmp_path / "out/stereo.json")
     assert pair.angle_deg == pytest.approx(20)
@@ -188,7 +188,7 @@ def test_two_cameras_see_one_test(tmp_path):
     assert rest[0] == pytest.approx(np.indices((60, 64))[::-1].reshape(2, -1).T, abs=1e-2)
     assert deformed[0] - rest[0] == pytest.approx(seen.reshape(2, -1).T, abs=2e-2)
     experiment = read_scene(path)
-    view = ViewPoint.both(experiment.scene, replace(experiment.second, angle_deg=20.0))[1]
+    view = ViewPoint.both(experiment.scene, experiment.second)[1]
     of_right, body = view.scene(experiment.scene), experiment.scene.body
     material = material_points(of_right, view.state(body), tuple(rest[1].T))
     before, after = (
@@ -197,5 +197,8 @@ def test_two_cameras_see_one_test(tmp_path):
     turn, shift = pair.poses[1]
     assert before == pytest.approx(points.reshape(3, -1).T @ turn.T + shift, abs=1e-3)
     assert after - before == pytest.approx(moved.reshape(3, -1).T @ turn.T, abs=1e-3)
+    with pytest.raises(InputError, match=r"angle_deg is 20, stated beside it are 30 degrees .*: state one of them"):
+        write_stereo_dataset(path, tmp_path / "none", 30.0)
     with pytest.raises(InputError, match="not 0"):
-        write_stereo_dataset(path, tmp_path / "none", 0.0)
+        replace(experiment.second, angle_deg=0.0)
+    assert not (tmp_path / "none").exists()
