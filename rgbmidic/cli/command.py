@@ -190,6 +190,7 @@ _ARGUMENT = re.compile("`([a-z_]+)(=True)?`")
 _OPTIONS = {
     "point_pairs": "points", "points": "point", "scale": "test",
     "lights": "light", "flats": "flat", "simultaneous": "together",
+    "angle_deg": "stereo",
 }  # fmt: skip
 """Options that have another name than the argument that they state."""
 

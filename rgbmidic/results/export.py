@@ -241,7 +241,7 @@ def export_result(
     if to not in EXPORT_FORMATS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     if (ending := _ENDINGS.get(out.suffix.lower(), to)) != to:
-        raise InputError(f"{out} ends as a file of the format {ending}, and {to} is what is written (--to): choose one")
+        raise InputError(f"{out} ends as a file of the format {ending}, and {to} is what is written (`to`): choose one")
     check_file(out, overwrite=overwrite)
     physical = ResultInUnits.from_result(result, scale)
     if (exporter := physical.exporter) is not None:

@@ -113,7 +113,7 @@ def write_stereo_dataset(
         if experiment.second is not None and angle_deg != second.angle_deg:
             raise InputError(
                 f"{scene_toml}: camera.second.angle_deg is {second.angle_deg:g}, stated beside it are {angle_deg:g} "
-                "degrees (--stereo): state one of them"
+                "degrees (`angle_deg`): state one of them"
             )
         second = replace(second, angle_deg=angle_deg)
     scene, states = experiment.scene, (State(), *experiment.states)
