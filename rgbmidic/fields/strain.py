@@ -573,7 +573,8 @@ class StrainGauges:
         """
         matrices = self.slopes if measured.all() else self._matrices(self.weights(measured))
         flat = np.where(measured[:, None], values.reshape(len(values), -1), 0.0)
-        return _slopes(matrices, flat).reshape(-1, *values.shape[1:], 2)
+        slopes = _slopes(matrices, flat)
+        return slopes.reshape(len(slopes), *values.shape[1:], 2)
 
     def slopes_of(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
         """Fit the planes to each component of the displacements of one frame.

@@ -365,8 +365,9 @@ def test_export(command: Run, tmp_path: Path) -> None:
     status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
     assert (status, (tmp_path / "a.npz").read_bytes()) == (2, content)
     assert "already exists" in error
-    assert command("export", result.path, "--to", "csv", "--out", tmp_path / "a.npz", "--overwrite")[0] == 0
-    assert (tmp_path / "a.npz").read_text().startswith("frame,")
+    (tmp_path / "a.csv").write_text("another")
+    assert command("export", result.path, "--to", "csv", "--out", tmp_path / "a.csv", "--overwrite")[0] == 0
+    assert (tmp_path / "a.csv").read_text().startswith("frame,")
 
 
 def test_export_takes_the_scale_of_another_test_file(command: Run, tmp_path: Path) -> None:
