@@ -18,7 +18,9 @@ from renders import kept_renders, new_renders
 
 from rgbmidic.tools import report
 
-settings.register_profile("on any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "on any machine", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)  # a verdict is of the code, not of the draw
 settings.load_profile("on any machine")
 _compilation = ExitStack()
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
