@@ -22,7 +22,7 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import Brightness, GainFit
+from rgbmidic.correlation.brightness import GainFit
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, gauss_newton_step
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
@@ -189,7 +189,7 @@ def _finer_field(
     problem, first = replace(problem, reference=fine), replace(first, reference=fine)
     without, noise = np.zeros((start.size, 0)), None if method is None else prior_weights  # without rigid functions
     equations = Equations.build(fine, weights, without, start, noise)
-    estimate = gauss_newton_step(problem, equations, first.brightness, estimate, first.difference)
+    estimate = gauss_newton_step(problem, equations, first, estimate)
     last = compare(problem, estimate)
     weights, loss = _precision_weights(method, last, prior_weights)
     equations = Equations.build(fine, weights, without, start, noise)
@@ -467,11 +467,5 @@ def _noise_residual(reference: Reference, noise: FloatImage, field: FloatArray) 
     motion = np.empty((2, noise.shape[1]), dtype=np.float32)
     interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, motion)
     difference = noise - reference.gradient[0] * motion[0] - reference.gradient[1] * motion[1]
-    count = len(noise)
-    return Residual(
-        reference=reference,
-        brightness=Brightness(gain=np.ones(count), offset=np.zeros((count, 3)), fit=None),
-        weights=reference.pixel_weights,
-        difference=difference,
-        moments=np.zeros((count, 0, 6)),
-    )
+    moments = np.zeros((len(noise), 0, 6))
+    return Residual(reference=reference, weights=reference.pixel_weights, difference=difference, moments=moments)

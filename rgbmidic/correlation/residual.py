@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
+from rgbmidic.correlation.brightness import ELEMENTS, GainFit, gain_and_offset, inverse_gains
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
@@ -36,14 +36,14 @@ class Residual:
     ----------
     reference
         The reference state.
-    brightness
-        Of the deformed images.
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
         f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
+    gain_fit
+        Of the local gains of g over f; None where the gain is one number.
 
     Examples
     --------
@@ -57,10 +57,10 @@ class Residual:
     """
 
     reference: Reference
-    brightness: Brightness
     weights: FloatImage
     difference: FloatImage
     moments: FloatArray
+    gain_fit: GainFit | None = None
 
     @classmethod
     def at(cls, reference: Reference, deformed: Deformed, displacements: Sequence[FloatArray]) -> Residual:
@@ -89,9 +89,17 @@ class Residual:
             reference_weights = reference.pixel_weights[lights], is_changed[lights]
             outputs = difference[lights], weights[lights], moments[lights]
             compare_states(*states, *reference_weights, *warp, pixels.offsets, *outputs)
-        brightness = reference.brightness_of(weights, moments, bool(is_changed.any()))
-        correct_brightness(*reference.brightness_fields(brightness, difference), pixels.offsets, difference)
-        return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
+        fit, (height, width) = reference.gain_fit, pixels.bounds[2:]
+        if fit is not None and is_changed.any():
+            fit = GainFit.over(values, weights, pixels, fit.sigma)
+        gain, offset = np.ones(len(values)), np.zeros((len(values), 3))
+        if reference.brightness != "none":
+            centres = reference.mesh.centres - pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, reference.constants.min_gain_correlation)
+        scales = inverse_gains(difference, gain, offset, fit, (height, width), reference.constants.least_gain)
+        rows = pixels.lines, pixels.run_offsets, pixels.offsets
+        correct_brightness(values, reference.inverse_level, *scales, offset, *rows, difference)
+        return cls(reference=reference, weights=weights, difference=difference, moments=moments, gain_fit=fit)
 
     @property
     def contrast(self) -> float:
@@ -163,7 +171,7 @@ class Residual:
     @property
     def smooth_fraction(self) -> float:
         """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
-        if (fit := self.brightness.fit) is None:
+        if (fit := self.gain_fit) is None:
             return 0.0
         smooth, total = fit.block_sums(self.difference).astype(np.float64), fit.totals
         squares = float(self.squares(self.weights)[..., 0].sum())

@@ -27,7 +27,7 @@ from rgbmidic.correlation.equations import (
     Problem,
     UnsolvableError,
     compare,
-    iterate,
+    gauss_newton_step,
 )
 from rgbmidic.correlation.light_bias import light_bias, with_consistent_gradient
 from rgbmidic.correlation.nodes import classify_nodes, matching_elements, misfit, one_sided_texture
@@ -139,7 +139,7 @@ def _held_elements(
 
     A one-sided texture does not hold a node either, but matches.
     """
-    if matched.all() and estimate.has_settled:
+    if matched.all() and estimate.remaining <= problem.constants.reweight_motion / 5:
         return matched
     table = BlockTable.of(residual, equations.weights, wide=True).together()
     std = standard_uncertainty(residual, table, equations, last.precision)
@@ -217,16 +217,28 @@ def solve(
 
 
 def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> Solution:
-    options = problem.options
+    tolerance = problem.options.tolerance
     estimate, weighting = _refine_initial_guess(problem, estimate, residual)
-    for _ in range(8):  # two or three do, but where elements come and go
-        equations = assemble(problem, weighting, estimate)
-        estimate = iterate(problem, equations, weighting.residual, estimate)
-        weighting = weigh(problem, weighting, equations, estimate)
-        is_settled = estimate.longest <= options.tolerance and weighting.has_converged(equations)
-        if is_settled or len(estimate.increments) >= options.max_iterations:
+    equations, are_final = assemble(problem, weighting, estimate), False
+    for _ in range(problem.options.max_iterations):
+        estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
+        if are_final and estimate.remaining <= tolerance / 5:
             break
+        if not estimate.has_settled(problem.constants.reweight_motion):
+            weighting, are_final = follow(problem, weighting, estimate), False
+            continue
+        weighting = weigh(problem, weighting, equations, estimate)
+        are_final = weighting.has_converged(equations)
+        if not are_final:
+            equations = assemble(problem, weighting, estimate)
     return conclude(problem, estimate, equations, weighting)
+
+
+@stage("iteration")
+def follow(problem: Problem, last: Weighting, estimate: Estimate) -> Weighting:
+    """Compare the states at an estimate, with the weights as they are."""
+    residual = compare(problem, estimate, last.residual.reference)
+    return replace(last, residual=replace(residual, weights=last.residual.weights))
 
 
 @stage("search")
@@ -304,7 +316,7 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
     # nodes that swing between two matches: where they are few their values are not known, else the frame's are not
-    is_moving = estimate.increments[-1] > problem.options.tolerance
+    is_moving = estimate.remainder * estimate.increments[-1] > problem.options.tolerance
     if is_moving.mean() < problem.constants.max_oscillating_fraction:
         std = np.where(is_moving[:, None], np.nan, std)
     positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
@@ -333,7 +345,7 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
     square, total, _ = squares.sum(axis=1).T
     sample = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
     total_weight, history = sample.sum(axis=0), estimate.history(measured)
-    converged = bool(history[-1] <= problem.options.tolerance)
+    converged = bool(estimate.remainder * history[-1] <= problem.options.tolerance)
     return replace(
         Solution.failed(mesh, len(reference.images), "", history),
         displacement=np.where(measured[:, None], field[:, :2], np.nan),
