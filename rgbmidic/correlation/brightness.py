@@ -201,36 +201,29 @@ def _offset_planes(points: list[FloatArray], values: list[FloatArray]) -> FloatA
     Reflections give single elements offsets, too: of the plane the fraction counts that it has of its mean square and
     of the scatter about it together.
     """
-    most, numbers = max(map(len, values)), np.array([len(one) for one in values])
+    numbers = np.array([*map(len, values)])
+    functions, planes = np.zeros((len(values), 4, numbers.max())), np.zeros((len(values), 3))  # 0 counts nowhere
     middle = np.array([one.mean(axis=0) for one in points])
     size = np.array([max(float(np.ptp(one, axis=0).max()), 1.0) for one in points])
-    # what is missing to the largest number is 0, and counts nowhere
-    functions, planes = np.zeros((len(values), 4, most)), np.zeros((len(values), 3))
-    for light, (point, value) in enumerate(zip(points, values, strict=True)):
-        functions[light, :, : len(value)] = np.ones(len(value)), *((point - middle[light]) / size[light]).T, value
+    for light, (at, value) in enumerate(zip(points, values, strict=True)):
+        functions[light, :, : len(value)] = np.ones(len(value)), *((at - middle[light]) / size[light]).T, value
         planes[light, 0] = np.median(value)
-    basis, level = functions[:, :3], functions[:, 3]
-    held = np.multiply.outer(numbers, np.diag([1e-9, 1e-3, 1e-3]))
-    scatter = np.zeros(len(values))
-    for _ in range(12):  # until weights and scatter have settled
-        deviation = level - np.einsum("la,lam->lm", planes, basis)
-        scatter = np.array([_scatter(one[:number]) for one, number in zip(deviation, numbers, strict=True)])
-        fits = (scatter > 0) & (numbers >= 12)  # four elements for each unknown
-        if not fits.any():
+    basis, held = functions[:, :3], np.multiply.outer(numbers, np.diag([1e-9, 1e-3, 1e-3]))
+    for _ in range(12):  # 4 do
+        fitted = np.einsum("la,lam->lm", planes, basis)  # no BLAS, whose sums may depend on threads
+        deviation = np.abs(functions[:, 3] - fitted)
+        # the standard deviation of a normal distribution with the same median
+        scatter = [1.5 * np.partition(one[:n], n // 2)[n // 2] for one, n in zip(deviation, numbers, strict=True)]
+        weight = 1 / (1 + (deviation / np.maximum(scatter, 1e-30)[:, None]) ** 2)
+        sums, last = np.einsum("lam,lbm->lab", basis * weight[:, None], functions), planes
+        planes = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0]
+        planes = np.where(numbers[:, None] >= 12, planes, last)  # four elements for each unknown
+        if (np.abs(planes - last).max(axis=1) <= np.multiply(0.01, scatter)).all():  # it is known to less
             break
-        weight = 1 / (1 + (deviation / np.where(fits, scatter, 1)[:, None]) ** 2)
-        # no BLAS, whose sums may depend on threads
-        sums = np.einsum("lam,lbm->lab", basis * weight[:, None], functions)
-        planes = np.where(fits[:, None], np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0], planes)
-    square = (np.einsum("la,lam->lm", planes, basis) ** 2).sum(axis=1) / numbers
-    planes *= (square / np.maximum(square + scatter**2, 1e-300))[:, None]
+    square = (fitted**2).sum(axis=1) / numbers
+    planes *= (square / np.maximum(square + np.square(scatter), 1e-300))[:, None]
     slopes = planes[:, 1:] / size[:, None]
     return np.column_stack([planes[:, 0] - (slopes * middle).sum(axis=1), slopes])
-
-
-def _scatter(values: FloatArray) -> float:
-    """Return the standard deviation of a normal distribution with the same median of the absolute values."""
-    return 1.5 * float(np.median(np.abs(values)))
 
 
 def window_width(
