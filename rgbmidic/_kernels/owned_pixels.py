@@ -217,62 +217,71 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
         _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
-@compiled("out", axis=1, fastmath=FAST)
+@compiled("out", axis=2, fastmath=FAST)
 def score_sums(
-    start, stop, residual, weights, gradient_x, gradient_y, values, inverse_level, lines, run_offsets, offsets, side,
-    out,
+    start, stop, residual, weights, gradient_x, gradient_y, images_x, images_y, values, inverse_level, lines,
+    run_offsets, offsets, side, out, common,
 ):  # fmt: skip
-    """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
+    """Sum ``w r gx``, ``w r gy``, ``w (gx gx + gy gy)`` and the pixels with weight over blocks of `side` px.
 
-    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight. One of (6, h, w)
-    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` times the
-    `inverse_level` and for those less the residual.
+    ``out`` (k, 4, h, w) receives them of each light, whose fields are (k, P). `common` (4, h, w) receives sums over the
+    lights; it is (0, h, w) where they are not asked for: ``w r gx`` and ``w r gy`` with the gradient of the images, and
+    ``w (gx df/dx + gy df/dy)``, by differences within each element, for f the `values` times the `inverse_level` and
+    for those less the residual.
     """
-    out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
-    size = largest_element(offsets) + LANES
-    # an array of its own: of a slice the compiler does not know that it is contiguous
-    scores, states = np.empty((len(out), size), dtype=np.float32), np.empty((4, size), dtype=np.float32)
-    inside, one = np.empty(largest_element(offsets), dtype=np.float32), np.uint64(1)
+    out[:, :, start:stop] = 0
+    common[:, start:stop] = 0
+    columns = np.zeros((4, out.shape[3] * side + LANES), dtype=np.float32)
+    largest, lights, one = largest_element(offsets) + LANES, len(weights), np.uint64(1)
+    scores, sums = np.empty((4, largest), dtype=np.float32), np.empty((4, largest), dtype=np.float32)
+    # arrays of their own: of a slice the compiler does not know that it is contiguous
+    half_x, half_y = np.empty((lights, largest), dtype=np.float32), np.empty((lights, largest), dtype=np.float32)
+    f, g = np.empty((lights, largest), dtype=np.float32), np.empty((lights, largest), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        scores[:] = 0
-        if len(out) > 4:
-            inside[:number] = _ONE
-            for q in range(run_offsets[e], run_offsets[e + 1]):
-                if number > 0:
-                    inside[np.uint64(lines[q, 0] + lines[q, 1] - 1) - first] = _ZERO
-        for light in range(len(weights)):
+        if number == 0:
+            continue
+        sums[:] = _ZERO
+        for light in range(lights):
             for i in range(number):
                 w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]
                 weighted = w * residual[light, first + i]
-                scores[0, i] += weighted * gx
-                scores[1, i] += weighted * gy
-                scores[2, i] += w * (gx * gx + gy * gy)
-                scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
-            if len(out) == 4 or number == 0:
+                scores[0, i] = weighted * gx
+                scores[1, i] = weighted * gy
+                scores[2, i] = w * (gx * gx + gy * gy)
+                scores[3, i] = _ONE if w > _ZERO else _ZERO
+            _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out[light])
+            if len(common) == 0:
                 continue
             for i in range(number):
-                w = _HALF * weights[light, first + i]
-                states[0, i], states[1, i] = w * gradient_x[light, first + i], w * gradient_y[light, first + i]
-                states[2, i] = values[light, first + i] * inverse_level[light, first + i]
-                states[3, i] = states[2, i] - residual[light, first + i]
-            for i in range(number - one):
-                mean = inside[i] * (states[0, i] + states[0, i + one])
-                scores[4, i] += mean * (states[2, i + one] - states[2, i])
-                scores[5, i] += mean * (states[3, i + one] - states[3, i])
-            for q in range(run_offsets[e], run_offsets[e + 1] - 1):
-                if lines[q + 1, 2] != lines[q, 2] + 1:
-                    continue
-                low = max(lines[q, 3], lines[q + 1, 3])
-                count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
-                a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
-                b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+                w, r = weights[light, first + i], residual[light, first + i]
+                sums[0, i] += w * r * images_x[light, first + i]
+                sums[1, i] += w * r * images_y[light, first + i]
+                half_x[light, i] = _HALF * w * gradient_x[light, first + i]
+                half_y[light, i] = _HALF * w * gradient_y[light, first + i]
+                f[light, i] = values[light, first + i] * inverse_level[light, first + i]
+                g[light, i] = f[light, i] - r
+        if len(common) == 0:
+            continue
+        for q in range(run_offsets[e], run_offsets[e + 1]):
+            a, length = np.uint64(lines[q, 0]) - first, np.uint64(lines[q, 1] - 1)
+            for light in range(lights):
+                for i in range(a, a + length):
+                    mean = half_x[light, i] + half_x[light, i + one]
+                    sums[2, i] += mean * (f[light, i + one] - f[light, i])
+                    sums[3, i] += mean * (g[light, i + one] - g[light, i])
+            if q + 1 == run_offsets[e + 1] or lines[q + 1, 2] != lines[q, 2] + 1:
+                continue
+            low = max(lines[q, 3], lines[q + 1, 3])
+            count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
+            a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
+            b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+            for light in range(lights):
                 for i in range(np.uint32(max(count, 0))):
-                    mean = states[1, a + i] + states[1, b + i]
-                    scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
-                    scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
-        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+                    mean = half_y[light, a + i] + half_y[light, b + i]
+                    sums[2, a + i] += mean * (f[light, b + i] - f[light, a + i])
+                    sums[3, a + i] += mean * (g[light, b + i] - g[light, a + i])
+        _add(sums, first, lines, run_offsets, e, start * side, stop * side, side, columns, common)
 
 
 @helper()

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.owned_pixels import score_sums
-from rgbmidic.correlation.assembly import block_side
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh.pixel_map import window_means
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -25,14 +24,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockTable:
-    """Sums over blocks, for each light or for all together.
+    """Sums over blocks, of each light or of all together.
 
     Attributes
     ----------
-    sums : ndarray, shape (k, 6, h, w)
-        Scores ``w r h`` in x and y, their information ``w |h|^2`` in both, and the number of pixels with
-        weight; then ``w h . grad`` of the grey levels of the reference and of the deformed image, but for a gradient
-        that is not the solve's.
+    sums : ndarray, shape (k, 4, h, w)
+        Scores ``w r h`` in x and y, their information ``w |h|^2`` in both, and the number of pixels with weight.
+    common : ndarray, shape (4, h, w)
+        Sums over the lights: scores in x and y with the gradient of each light's own image, and ``w h . grad`` of the
+        grey levels of the reference and of the deformed image. (0, h, w) for a gradient that is not the solve's.
     side : int
         Of the blocks, px.
     reference
@@ -40,27 +40,31 @@ class BlockTable:
     """
 
     sums: FloatArray
+    common: FloatArray
     side: int
     reference: Reference
 
     @classmethod
-    def of(
-        cls, residual: Residual, weights: FloatImage, *, gradient: FloatImage | None = None, wide: bool = False
-    ) -> BlockTable:
-        """Sum each light for itself, with the weights (k, P) of a solve and a `gradient` (2, k, P) that it is not.
+    def of(cls, residual: Residual, weights: FloatImage, gradient: FloatImage | None = None) -> BlockTable:
+        """Sum each light for itself, with weights (k, P) and a `gradient` (2, k, P); None: that of the solve."""
+        reference, pixels = residual.reference, residual.reference.pixels
+        side = reference.constants.block_side
+        grid = pixels.grid(side)
+        sums = np.empty((len(weights), 4, *grid), dtype=np.float32)
+        common = np.empty((4 if gradient is None else 0, *grid), dtype=np.float32)
+        gradients = (reference.gradient, reference.texture.images) if gradient is None else (gradient, gradient)
+        # where the last sums are asked for they need the grey levels of the reference, and one over their local mean
+        levels = (reference.values, reference.inverse_level) if gradient is None else (weights, weights)
+        fields = residual.difference, weights, *gradients[0], *gradients[1], *levels
+        score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, sums, common)
+        return cls(sums=sums.astype(np.float64), common=common.astype(np.float64), side=side, reference=reference)
 
-        Wide blocks grow with the elements: what these cannot follow is alike over them.
-        """
-        reference, pixels, constants = residual.reference, residual.reference.pixels, residual.reference.constants
-        side = block_side(pixels, reference.mesh.size, constants) if wide else constants.min_block_side
-        sums = np.empty((len(weights), 6 if gradient is None else 4, *pixels.grid(side)), dtype=np.float32)
-        columns = residual.difference, weights, *(reference.gradient if gradient is None else gradient)
-        # the last two sums need the grey levels of the reference, and one over their local mean
-        columns += (reference.values, reference.inverse_level) if gradient is None else columns[:2]
-        for light, out in enumerate(sums):
-            fields = (column[light : light + 1] for column in columns)
-            score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
-        return cls(sums=sums.astype(np.float64), side=side, reference=reference)
+    def over_elements(self) -> BlockTable:
+        """Merge blocks where elements are larger: what these cannot follow is alike over them."""
+        reference = self.reference
+        side = reference.constants.score_block_side(reference.mesh.size, reference.pixels.bounds[2:])
+        sums, common = (_merged(grids, side // self.side) for grids in (self.sums, self.common))
+        return replace(self, sums=sums, common=common, side=side)
 
     def together(self) -> BlockTable:
         """Return the table of all lights as one, whose pixels are those of the light that shows most of a block."""
@@ -132,19 +136,21 @@ class BlockTable:
         Where glare or paint has changed since, the deformed image shows less of it. 1 where there is no texture.
         """
         smoothing = self.reference.constants.information_smoothing
-        reference, deformed = self.at(np.stack([window_means(grid, smoothing) for grid in self.sums[0, 4:]]), points)
+        reference, deformed = self.at(window_means(self.common[2:], smoothing), points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
     def windowed_means(self, grids: AnyArray) -> AnyArray:
         """Means of grids (..., h, w) over the window in which scores are averaged."""
         return window_means(grids, self.reference.constants.score_range / self.side)
 
-    def typical_ratio(self, scores: FloatArray) -> float:
-        """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
-        numerator, denominator = (
-            _typical_squares(self._relative(values[None]), self.sums[:, 3])[0] for values in (scores, self.sums[0, :2])
-        )
-        return float(numerator / denominator) if denominator > 0 else 0.0
+    def disagreement_by_chance(self) -> float:
+        """Typical square of the scores that the gradients of the lights' own images add, over that of all scores.
+
+        Of a table of all lights together.
+        """
+        scores = self.sums[0, :2], self.common[:2] - self.sums[0, :2]
+        total, alone = (_typical_squares(self._relative(values[None]), self.sums[:, 3])[0] for values in scores)
+        return float(alone / total) if total > 0 else 0.0
 
     def _relative(self, scores: FloatArray) -> FloatArray:
         """Scores (k, 2, h, w) over the root of the information around them.
@@ -159,6 +165,13 @@ class BlockTable:
         level = information / np.maximum(pixels, 1e-6)
         usable = ((level > 0) & (counts > 0))[:, None]
         return np.asarray(np.divide(scores, np.sqrt(level)[:, None], out=np.zeros_like(scores), where=usable))
+
+
+def _merged(grids: FloatArray, number: int) -> FloatArray:
+    """Sum grids (..., h, w) over squares of `number` blocks a side; those at the end may hold fewer."""
+    for axis in (-2, -1):
+        grids = np.add.reduceat(grids, np.arange(0, grids.shape[axis], number), axis=axis) if number > 1 else grids
+    return grids
 
 
 def _typical_squares(scores: FloatArray, counts: FloatArray) -> FloatArray:

@@ -223,7 +223,7 @@ def _precision_weights(
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
-    table, mesh = BlockTable.of(residual, weights, wide=True).together(), residual.reference.mesh
+    table, mesh = BlockTable.of(residual, weights).over_elements().together(), residual.reference.mesh
     x, y, information, count = table.sums[0, :4]
     xx, yy, information, count = map(table.windowed_means, (x * x, y * y, information, count))
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)

@@ -18,7 +18,6 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh.recovery import Functional, Recovery, functional_std
-from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic.weights.precision import Precision
 
@@ -75,7 +74,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     if lost.ndim:
         lost = np.repeat(lost, np.diff(pixels.offsets))
     full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
-    table = BlockTable.of(replace(residual, difference=full_difference), weights, wide=True)
+    table = BlockTable.of(replace(residual, difference=full_difference), weights).over_elements()
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
     roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
@@ -106,20 +105,6 @@ def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> 
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-def _in_reference_axes(functional: Functional, deformation: FloatArray) -> Functional:
-    """Return a quantity linear in the displacement as one of the motion in axes that follow the surface."""
-    matrices = [matrix for matrix in functional if matrix is not None]  # of one structure
-    axes = [axis for axis, matrix in enumerate(functional) if matrix is not None]
-    along_x, along_y = (
-        with_data(
-            matrices[0],
-            sum(matrix.data * row[axis][matrix.indices] for matrix, axis in zip(matrices, axes, strict=True)),
-        )
-        for row in deformation.T
-    )
-    return along_x, along_y
-
-
 def _rigid_variance(
     residual: Residual, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
 ) -> FloatArray:
@@ -138,11 +123,13 @@ def _rigid_variance(
         if a != b:
             products[b] += covariance @ gains[a]
     coefficients = np.einsum("jnc,jnd->cd", gains, products)
-    shared, variance = equations.solve(products.sum(axis=0)), []
-    for along_x, along_y in functionals:
+    motions = (rigid.response, equations.solve(products.sum(axis=0)))
+    by_axis = [equations.turned(motion.reshape(len(motion) // 2, 2, -1)).swapaxes(0, 1) for motion in motions]
+    variance = []
+    for functional in functionals:
         response, common = (
-            sum(matrix @ column[axis::2] for axis, matrix in enumerate((along_x, along_y)) if matrix is not None)
-            for column in (rigid.response, shared)
+            sum(matrix @ along for matrix, along in zip(functional, axes, strict=True) if matrix is not None)
+            for axes in by_axis
         )
         variance.append(((response @ coefficients - 2 * common) * response).sum(axis=1))
     return np.stack(variance, axis=1)
@@ -160,20 +147,26 @@ def _probed_std(
     """
     mesh, assembly, lost = reference.material, reference.assembly, reference.constants.max_std
     limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(quantities) - 2), assembly.matrix(scores)
-    std = functional_std(equations.solve, covariance, mesh, quantities)
+
+    def solve(columns: FloatArray) -> FloatArray:
+        """Solve for functionals (2 N, R) of the displacement, which the surface has turned."""
+        turned = np.swapaxes(equations.deformation, 1, 2) @ columns.reshape(len(mesh.nodes), 2, -1)
+        return equations.solve(turned.reshape(columns.shape))
+
+    std = functional_std(solve, covariance, mesh, quantities)
     far = np.zeros(std.shape, dtype=bool)
     while ((std > limits) & ~far).any():
         far |= std > limits
         remaining = [
             (functional, nodes & ~excluded) for (functional, nodes), excluded in zip(quantities, far.T, strict=True)
         ]
-        std = np.where(far, std, functional_std(equations.solve, covariance, mesh, remaining))
+        std = np.where(far, std, functional_std(solve, covariance, mesh, remaining))
     if not far.any():
         return std
     score, information = (np.einsum("eaad->ed", blocks)[:, ::2].sum(axis=1) for blocks in (scores, equations.blocks))
     ratio, min_ratio = score / np.maximum(information, 1e-300), np.full(len(std), np.inf)
     np.minimum.at(min_ratio, mesh.elements[information > 0], ratio[information > 0, None])
-    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, remaining)
+    allowed = functional_std(solve, assembly.matrix(equations.blocks), mesh, remaining)
     return np.maximum(std, allowed * np.sqrt(np.where(min_ratio < np.inf, min_ratio, 0))[:, None])
 
 
@@ -208,7 +201,6 @@ def standard_uncertainty(
     if recovery is not None:
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         quantities += [(functional, inner) for functional in recovery.strain_functionals]
-    quantities = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in quantities]
     std = _probed_std(equations, score_covariance(table, equations.blocks), reference, quantities)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in quantities])
@@ -218,39 +210,37 @@ def standard_uncertainty(
     return std
 
 
-def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
-    """Step (N, 2) that the gradients of the lights' own images would make from the solution."""
-    reference = residual.reference
-    images = zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
-    pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in images])
-    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
-    return equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
-
-
-def excess_over_chance(
-    step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
+def gradient_disagreement(
+    residual: Residual, table: BlockTable, equations: Equations, recovery: Recovery, std: FloatArray
 ) -> FloatArray:
-    """Return what the recovered step (N, 2) of `gradient_step` has beyond chance, over the uncertainty, (N,).
+    """Factor (N,) on the uncertainty by what the gradients of the lights' own images disagree with those of the solve.
 
     Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
     uncertainty as the scores of what a light alone shows have of all scores, typically. Where a reflection does not
     follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md). A single step is a poor estimate of its variance: both directions have
-    their mean.
+    (docs/explanation/uncertainty.md): the step that they would make from the solution is stated beyond chance. A single
+    step is a poor estimate of its variance: both directions have their mean.
 
     Parameters
     ----------
-    step, std : ndarray, shape (N, 2)
-        Of u and v.
-    residual, table
+    residual
+        At the solution.
+    table
+        Of all lights together.
+    equations, recovery
         Of the solution.
-    weights : ndarray, shape (k, P), float32
-        Of the solve.
+    std : ndarray, shape (N, 5)
+        Standard uncertainty by noise.
     """
-    reference = table.reference
-    images = BlockTable.of(residual, weights, gradient=reference.texture.images, wide=True).together()
-    chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
-        (images.sums - table.sums[:, :4])[0, :2]
-    )
-    square = ((step / np.maximum(std, 1e-30)) ** 2).mean(axis=1)
-    return np.asarray(np.sqrt(np.maximum(square - chance, 0)))
+    reference = residual.reference
+    if len(equations.weights) == 1:
+        return np.ones(len(std))
+    pulls = [
+        reference.assembly.vector(reference.projected(*light))
+        for light in zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
+    ]
+    pull, rigid_pull = np.sum(pulls, axis=0), (np.array(pulls[1:]) @ equations.functions).ravel()
+    step = recovery.value @ equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
+    square = ((step / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
+    chance = np.nan_to_num(reference.residual_leverage).mean() * table.disagreement_by_chance()
+    return np.sqrt(1 + np.maximum(square - chance, 0))
