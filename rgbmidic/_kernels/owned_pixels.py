@@ -226,8 +226,8 @@ def score_sums(
 
     ``out`` (k, 4, h, w) receives them of each light, whose fields are (k, P). `common` (4, h, w) receives sums over the
     lights; it is (0, h, w) where they are not asked for: ``w r gx`` and ``w r gy`` with the gradient of the images, and
-    ``w (gx df/dx + gy df/dy)``, by differences within each element, for f the `values` times the `inverse_level` and
-    for those less the residual.
+    ``w (gx df/dx + gy df/dy)``, by differences from every other row of each element, for f the `values` times the
+    `inverse_level` and for those less the residual.
     """
     out[:, :, start:stop] = 0
     common[:, start:stop] = 0
@@ -263,7 +263,7 @@ def score_sums(
                 g[light, i] = f[light, i] - r
         if len(common) == 0:
             continue
-        for q in range(run_offsets[e], run_offsets[e + 1]):
+        for q in range(run_offsets[e], run_offsets[e + 1], 2):
             a, length = np.uint64(lines[q, 0]) - first, np.uint64(lines[q, 1] - 1)
             for light in range(lights):
                 for i in range(a, a + length):

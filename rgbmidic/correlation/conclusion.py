@@ -79,8 +79,8 @@ def _field(problem: Problem, estimate: Estimate, equations: Equations, weighting
 
 def _unsettled(problem: Problem, estimate: Estimate) -> BoolArray:
     """Nodes (N,) that swing between two matches: where they are many none, for then the frame has not converged."""
-    is_moving = np.asarray(estimate.increments[-1] > problem.options.tolerance)
-    return is_moving & (is_moving.mean() < problem.constants.max_oscillating_fraction)
+    is_moving = estimate.increments[-1] > problem.options.tolerance
+    return np.asarray(is_moving & (is_moving.mean() < problem.constants.max_oscillating_fraction))
 
 
 def _node_status(problem: Problem, equations: Equations, weighting: Weighting, field: _Field) -> npt.NDArray[np.uint8]:

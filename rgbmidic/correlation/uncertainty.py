@@ -243,4 +243,4 @@ def gradient_disagreement(
     step = recovery.value @ equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
     square = ((step / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.disagreement_by_chance()
-    return np.sqrt(1 + np.maximum(square - chance, 0))
+    return np.asarray(np.sqrt(1 + np.maximum(square - chance, 0)))
