@@ -286,7 +286,7 @@ def mean_residual_leverage(
     constants
         Of the solve.
     """
-    side = constants.score_block_side(mesh.size, pixels.bounds[2:])
+    side = constants.merged_block_side(mesh.size, pixels.bounds[2:])
     rows, columns = pixels.grid(side)
     # of 700 blocks the random signs keep the projections apart to half a per cent of the fraction (derived)
     stride = int(np.clip(np.ceil(2 * np.sqrt(700 / (rows * columns))), 2, 4))

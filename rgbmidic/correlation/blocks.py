@@ -48,7 +48,7 @@ class BlockTable:
     def of(cls, residual: Residual, weights: FloatImage, gradient: FloatImage | None = None) -> BlockTable:
         """Sum each light for itself, with weights (k, P) and a `gradient` (2, k, P); None: that of the solve."""
         reference, pixels = residual.reference, residual.reference.pixels
-        side = reference.constants.block_side
+        side = reference.constants.score_block_side
         grid = pixels.grid(side)
         sums = np.empty((len(weights), 4, *grid), dtype=np.float32)
         common = np.empty((4 if gradient is None else 0, *grid), dtype=np.float32)
@@ -62,7 +62,7 @@ class BlockTable:
     def over_elements(self) -> BlockTable:
         """Merge blocks where elements are larger: what these cannot follow is alike over them."""
         reference = self.reference
-        side = reference.constants.score_block_side(reference.mesh.size, reference.pixels.bounds[2:])
+        side = reference.constants.merged_block_side(reference.mesh.size, reference.pixels.bounds[2:])
         sums, common = (_merged(grids, side // self.side) for grids in (self.sums, self.common))
         return replace(self, sums=sums, common=common, side=side)
 
