@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.owned_pixels import score_sums
 from rgbmidic.correlation.reference import Reference
@@ -45,8 +46,27 @@ class BlockTable:
     reference: Reference
 
     @classmethod
-    def of(cls, residual: Residual, weights: FloatImage, gradient: FloatImage | None = None) -> BlockTable:
-        """Sum each light for itself, with weights (k, P) and a `gradient` (2, k, P); None: that of the solve."""
+    def of(
+        cls,
+        residual: Residual,
+        weights: FloatImage,
+        *,
+        gradient: FloatImage | None = None,
+        deviation: FloatImage | None = None,
+    ) -> BlockTable:
+        """Sum each light for itself.
+
+        Parameters
+        ----------
+        residual
+            The comparison.
+        weights : ndarray, shape (k, P), float32
+            Of the solve.
+        gradient : ndarray, shape (2, k, P), float32, optional
+            With which scores are made; None: that of the solve.
+        deviation : ndarray, shape (E, 2, 6), float32, optional
+            What the field has beyond the solution (`curved_deviation`), whose effect is no part of the residual.
+        """
         reference, pixels = residual.reference, residual.reference.pixels
         side = reference.constants.score_block_side
         grid = pixels.grid(side)
@@ -55,8 +75,10 @@ class BlockTable:
         gradients = (reference.gradient, reference.texture.images) if gradient is None else (gradient, gradient)
         # where the last sums are asked for they need the grey levels of the reference, and one over their local mean
         levels = (reference.values, reference.inverse_level) if gradient is None else (weights, weights)
+        polynomials = np.empty((0, 2, 6), dtype=np.float32) if deviation is None else deviation
         fields = residual.difference, weights, *gradients[0], *gradients[1], *levels
-        score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, sums, common)
+        geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+        score_sums(*fields, polynomials, *geometry, side, sums, common)
         return cls(sums=sums.astype(np.float64), common=common.astype(np.float64), side=side, reference=reference)
 
     def over_elements(self) -> BlockTable:
@@ -71,6 +93,19 @@ class BlockTable:
         sums = self.sums.sum(axis=0)
         sums[3] = self.sums[:, 3].max(axis=0)
         return replace(self, sums=sums[None])
+
+    def with_common_scores(self) -> BlockTable:
+        """Put back what the fit has taken of the scores that the lights have in common, by their information of it."""
+        reference = self.reference
+        lost = 1 / np.sqrt(reference.residual_leverage) - 1
+        if np.ndim(lost):  # of the element nearest to each block
+            rows, columns = (np.indices(self.sums.shape[2:]) + 0.5) * self.side
+            centres = np.stack([columns, rows], axis=-1) + reference.pixels.bounds[1::-1]
+            lost = np.asarray(lost)[cKDTree(reference.mesh.centres).query(centres)[1]]
+        information, sums = self.sums[:, 2], self.sums.copy()
+        fraction = information / np.maximum(information.sum(axis=0), 1e-30)
+        sums[:, :2] += (lost * fraction)[:, None] * self.sums[:, :2].sum(axis=0)
+        return replace(self, sums=sums)
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:
         """Interpolate grids (n, h, w) at points (M, 2) in px, (n, M)."""
@@ -144,13 +179,14 @@ class BlockTable:
         return window_means(grids, self.reference.constants.score_range / self.side)
 
     def disagreement_by_chance(self) -> float:
-        """Typical square of the scores that the gradients of the lights' own images add, over that of all scores.
-
-        Of a table of all lights together.
-        """
-        scores = self.sums[0, :2], self.common[:2] - self.sums[0, :2]
-        total, alone = (_typical_squares(self._relative(values[None]), self.sums[:, 3])[0] for values in scores)
-        return float(alone / total) if total > 0 else 0.0
+        """Typical square of the scores that the gradients of the lights' own images add, over that of all scores."""
+        table = self.together()
+        total = table.sums[0, :2]
+        square, alone = (
+            _typical_squares(table._relative(scores[None]), table.sums[:, 3])[0]
+            for scores in (total, self.common[:2] - total)
+        )
+        return float(alone / square) if square > 0 else 0.0
 
     def _relative(self, scores: FloatArray) -> FloatArray:
         """Scores (k, 2, h, w) over the root of the information around them.

@@ -17,6 +17,7 @@ from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError
 from rgbmidic.correlation.light_bias import light_bias
 from rgbmidic.correlation.nodes import classify_nodes, misfit, one_sided_texture
+from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.uncertainty import gradient_disagreement, standard_uncertainty
 from rgbmidic.mesh.recovery import Recovery
@@ -58,19 +59,18 @@ def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighti
 
 def _field(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> _Field:
     """Recover the field from the linear fit, correct it by the bias of the lights, and state its uncertainty."""
-    mesh, fitted = problem.reference.mesh, estimate.displacement
+    mesh, residual, fitted = problem.reference.mesh, weighting.residual, estimate.displacement
     active = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(problem.reference.material, active, equations.information())
     curvature = map(equations.turned_back, recovery.offset_and_curvature(fitted))
-    residual = weighting.residual.subtract_curvature(*curvature)
-    lights = BlockTable.of(residual, equations.weights)
-    table = lights.over_elements().together()
-    std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
-    std *= gradient_disagreement(weighting.residual, table, equations, recovery, std)[:, None]
+    deviation = curved_deviation(problem.reference.material, residual.reference.pixels.barycentric, *curvature)
+    table = BlockTable.of(residual, equations.weights, deviation=deviation)
+    std = standard_uncertainty(table, equations, weighting.precision, recovery)
+    std *= gradient_disagreement(residual, table, equations, recovery, std)[:, None]
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        bias, bias_std = light_bias(lights, equations)
-    sensitivity = table.sensitivity(mesh.nodes)
+        bias, bias_std = light_bias(table, equations)
+    sensitivity = table.over_elements().sensitivity(mesh.nodes)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     std = np.where(_unsettled(problem, estimate)[:, None], np.nan, np.hypot(std, bias_std) * scale)
     values = recovery.field(*(fitted + bias).T)

@@ -141,8 +141,7 @@ def _held_elements(
     """
     if matched.all() and estimate.has_settled:
         return matched
-    table = BlockTable.of(residual, equations.weights).over_elements().together()
-    std = standard_uncertainty(residual, table, equations, last.precision)
+    std = standard_uncertainty(BlockTable.of(residual, equations.weights), equations, last.precision)
     lost = (std.max(axis=1) > problem.constants.max_std) & ~one_sided_texture(equations, residual)
     return np.asarray(matched & ~lost[problem.reference.mesh.elements].any(axis=1))
 

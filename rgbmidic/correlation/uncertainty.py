@@ -6,7 +6,6 @@ The scores' covariance is the information times the design effect of the table o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -37,7 +36,7 @@ def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     Parameters
     ----------
     table
-        Of the solution.
+        Of the solution, of all lights together.
     texture : ndarray, shape (E, 3, 3, 3)
         Element blocks of its Hessian.
     """
@@ -46,35 +45,28 @@ def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     return np.asarray(texture * scale[:, None, None])
 
 
-def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple[int, int, FloatArray]]:
+def light_covariances(table: BlockTable, equations: Equations) -> Iterator[tuple[int, int, FloatArray]]:
     """Covariance of the right-hand sides of each two lights a and b >= a.
 
     A light's own is as in `score_covariance`; that of two is the root of both, times the correlation of their scores
     where both see. Of what the lights have in common the fit leaves the fraction `residual_leverage`, which is put back
-    before the scores are summed; it takes nothing of what they differ by.
+    before: each light has its fraction of the information of it. The fit takes nothing of what they differ by.
 
     Parameters
     ----------
-    residual
-        At the solution.
-    weights : ndarray, shape (k, P), float32
-        Of the solve.
+    table
+        Of the solution, of each light.
+    equations
+        Of the solution.
 
     Yields
     ------
     tuple
         Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
-    reference = residual.reference
-    mesh, pixels, slopes = reference.mesh, reference.pixels, reference.gradient
-    score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
-    information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
-    common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
-    lost = np.asarray(1 / np.sqrt(reference.residual_leverage) - 1, dtype=np.float32)
-    if lost.ndim:
-        lost = np.repeat(lost, np.diff(pixels.offsets))
-    full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
-    table = BlockTable.of(replace(residual, difference=full_difference), weights).over_elements()
+    reference, weights = table.reference, equations.weights
+    mesh, slopes = reference.mesh, reference.gradient
+    table = table.over_elements().with_common_scores()
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
     roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
@@ -106,7 +98,7 @@ def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> 
 
 
 def _rigid_variance(
-    residual: Residual, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
+    table: BlockTable, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
 ) -> FloatArray:
     """Variance (N, F) that the error of the rigid coefficients adds to quantities linear in the displacement.
 
@@ -115,9 +107,9 @@ def _rigid_variance(
     the covariance of q_j and q_l a quantity ``a^T u`` gets ``(a^T X) Cov(e) (X^T a) - 2 (a^T M^-1 Cov(q, e)) (X^T a)``,
     where ``Cov(e) = sum G_j^T S_jl G_l`` and ``Cov(q, e) = sum S_jl G_l``.
     """
-    gains, assembly = rigid.relative_modes @ rigid.inverse, residual.reference.assembly
+    gains, assembly = rigid.relative_modes @ rigid.inverse, table.reference.assembly
     products = np.zeros_like(gains)
-    for a, b, blocks in light_covariances(residual, equations.weights):
+    for a, b, blocks in light_covariances(table, equations):
         covariance = assembly.matrix(blocks)
         products[a] += covariance @ gains[b]
         if a != b:
@@ -171,11 +163,7 @@ def _probed_std(
 
 
 def standard_uncertainty(
-    residual: Residual,
-    table: BlockTable,
-    equations: Equations,
-    precision: Precision | None,
-    recovery: Recovery | None = None,
+    table: BlockTable, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
     """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
@@ -185,8 +173,8 @@ def standard_uncertainty(
 
     Parameters
     ----------
-    residual, table, equations, precision
-        Of the last pass.
+    table, equations, precision
+        Of the solution, the table of each light.
     recovery
         Of the field from the linear fit; None for the fit itself.
 
@@ -195,15 +183,16 @@ def standard_uncertainty(
     ndarray, shape (N, 2) or (N, 5)
         Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
     """
-    reference, textured = residual.reference, equations.textured
+    reference, textured = table.reference, equations.textured
     value = sp.eye(len(textured), format="csr") if recovery is None else recovery.value
     quantities: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
     if recovery is not None:
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         quantities += [(functional, inner) for functional in recovery.strain_functionals]
-    std = _probed_std(equations, score_covariance(table, equations.blocks), reference, quantities)
+    scores = score_covariance(table.over_elements().together(), equations.blocks)
+    std = _probed_std(equations, scores, reference, quantities)
     if equations.rigid is not None:
-        rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in quantities])
+        rigid = _rigid_variance(table, equations, equations.rigid, [functional for functional, _ in quantities])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * robust_loss(precision, reference, equations.weights)[:, None]
@@ -223,10 +212,8 @@ def gradient_disagreement(
 
     Parameters
     ----------
-    residual
-        At the solution.
-    table
-        Of all lights together.
+    residual, table
+        At the solution, of each light.
     equations, recovery
         Of the solution.
     std : ndarray, shape (N, 5)
@@ -242,5 +229,5 @@ def gradient_disagreement(
     pull, rigid_pull = np.sum(pulls, axis=0), (np.array(pulls[1:]) @ equations.functions).ravel()
     step = recovery.value @ equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
     square = ((step / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
-    chance = np.nan_to_num(reference.residual_leverage).mean() * table.disagreement_by_chance()
+    chance = np.nan_to_num(reference.residual_leverage).mean() * table.over_elements().disagreement_by_chance()
     return np.asarray(np.sqrt(1 + np.maximum(square - chance, 0)))

@@ -57,8 +57,9 @@ def test_scores_of_each_light_and_the_slopes_of_both_states_together(pixels, sid
     residual, gx, gy, own_x, own_y, values, inverse = random.normal(size=(7, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
     out, common = (np.full((*n, *pixels.grid(side)), 7, dtype=np.float32) for n in ((3, 4), (number,)))
-    lines = pixels.lines, pixels.run_offsets, pixels.offsets
-    score_sums(residual, weight, gx, gy, own_x, own_y, values, inverse, *lines, side, out, common)
+    fields = residual, weight, gx, gy, own_x, own_y, values, inverse, np.empty((0, 2, 6), dtype=np.float32)
+    geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+    score_sums(*fields, *geometry, side, out, common)
     scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2), weight > 0
     expected = np.stack([expected_sums(pixels, light, side) for light in zip(*scores, strict=True)])
     np.testing.assert_allclose(out, expected, atol=4e-4)
@@ -85,7 +86,9 @@ def test_the_same_bits_on_one_and_three_threads(pixels):
         sums, common = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
         summed = np.zeros((2, *common.shape), np.float32)
         product_sums(values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, sums)
-        score_sums(*[values] * 8, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed, common)
+        geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+        polynomials = np.ones((len(pixels.origin), 2, 6), dtype=np.float32)
+        score_sums(*[values] * 8, polynomials, *geometry, 4, summed, common)
         blocks = pixels.block_sums(values, 5)
         return sums, summed, common, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
 
