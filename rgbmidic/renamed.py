@@ -32,7 +32,6 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "rgbmidic.settings": {"regular": "require_regular_file", "plain": "to_plain"},
     "Deformed": {"pictures": "images_on_first_light", "partial": "nonuniform_weight_blocks"},
     "Reference": {"unfitted": "residual_leverage"},
-    "Residual": {"without": "subtract_curvature"},
     "Precision": {"bend": "loss_curvature"},
     "rgbmidic.fields": {"Places": "MeshPoints", "Nodal": "Displacement", "History": "Field"},
     "MeshPoints": {"parts": "subdivide", "where": "bounds_text"},

@@ -16,18 +16,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
-from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
+from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.brightness import ELEMENTS, GainFit, gain_and_offset, inverse_gains
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.precision import Precision
 
 
-@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
     """Both states at the owned pixels of the reference.
@@ -176,26 +174,6 @@ class Residual:
         smooth, total = fit.block_sums(self.difference).astype(np.float64), fit.totals
         squares = float(self.squares(self.weights)[..., 0].sum())
         return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(squares, 1e-300)
-
-    def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
-        """Take out what a curved field has over its own linear fit.
-
-        Parameters
-        ----------
-        nodal_offset : ndarray, shape (N, 2)
-            What the fit has at the nodes beyond the field, px, in the axes of the reference.
-        curvature : ndarray, shape (N, 2, 3)
-            Second derivatives xx, xy, yy of the field at the nodes, 1/px, in the axes of the reference.
-
-        Returns
-        -------
-        Residual
-        """
-        reference, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
-        deviation = curved_deviation(reference.material, pixels.barycentric, nodal_offset, curvature)
-        pixel_positions = pixels.local_x, pixels.local_y, pixels.offsets
-        subtract_quadratic(self.difference, *reference.gradient, deviation, *pixel_positions, out)
-        return replace(self, difference=out)
 
 
 class PrecisionMethod(Protocol):

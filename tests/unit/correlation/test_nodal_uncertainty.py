@@ -40,8 +40,8 @@ def test_the_unfitted_share_is_that_of_the_projection(size, prefilter):
         for node, (constant, in_x, in_y) in zip(corners, pixels.barycentric[element], strict=True):
             values = constant + in_x * pixels.local_x[own] + in_y * pixels.local_y[own]
             columns[own, node] = values[:, None] * np.stack([slope[own] for slope in slopes], axis=1)
-    (top, left, _, _), grid = pixels.bounds, pixels.grid(USUAL.min_block_side)
-    index = (pixels.rows - top) // USUAL.min_block_side * grid[1] + (pixels.columns - left) // USUAL.min_block_side
+    (top, left, _, _), grid = pixels.bounds, pixels.grid(USUAL.score_block_side)
+    index = (pixels.rows - top) // USUAL.score_block_side * grid[1] + (pixels.columns - left) // USUAL.score_block_side
     used = reference.pixel_weights[0] > 0
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
