@@ -12,13 +12,11 @@ from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
-from rgbmidic.frames.bitmaps import BmpFile, PgmFile
+from rgbmidic.extensions import FRAME_FORMATS
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
-from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
 from rgbmidic.frames.metadata import CameraMetadata
-from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
@@ -95,19 +93,14 @@ FORMATS = (
         source=HeaderlessFile,
     ),
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
-    FrameFormat(name="PGM", endings=(".pgm",), source=PgmFile),
-    FrameFormat(name="BMP", endings=(".bmp",), source=BmpFile),
     FrameFormat(name="TIFF stacks", recognises=_is_tiff_stack, source=TiffStack),
     FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=_is_tiff, source=TiffFile),
-    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
         source=CameraRaw,
     ),
-    FrameFormat(name="Photron .mraw with .cihx or .cih", movies=MRAW_ENDINGS, source=MrawFile),
-    FrameFormat(name="NorPix .seq", movies=(".seq",), source=SeqFile),
     FrameFormat(name="stacks in .npy files", movies=(".npy",), source=NpyFile),
     FrameFormat(
         name="stacks in HDF5 files",
@@ -149,18 +142,15 @@ def frame_formats() -> tuple[FrameFormat, ...]:
     >>> any(".dng" in frame_format.endings for frame_format in frame_formats())
     True
     """
-    return (*FORMATS, *_plugin_formats())
+    return (*FORMATS, *(entry for formats in FRAME_FORMATS.values() for entry in formats()), *_plugin_formats())
 
 
+_MOVIE = "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern"
 _ADVICE = (
     (
         (".mp4", ".avi", ".mov", ".mkv", ".wmv"),
         "a movie whose frames are compressed or demosaiced, so that its samples are no longer the sensor's: give the "
         "camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
-    ),
-    (
-        tuple(ending for frame_format in FORMATS for ending in frame_format.movies),
-        "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern",
     ),
     (
         (".jpg", ".jpeg", ".gif", ".heic", ".webp"),
@@ -176,7 +166,10 @@ _ADVICE = (
 
 def advice(path: Path) -> str:
     """Return what a file is that is no frame, and what to do; empty where that is not known."""
-    return next((text for endings, text in _ADVICE if path.suffix.lower() in endings), "")
+    ending = path.suffix.lower()
+    if any(ending in frame_format.movies for frame_format in frame_formats()):
+        return _MOVIE
+    return next((text for endings, text in _ADVICE if ending in endings), "")
 
 
 class _UnknownFile(FrameSource):

@@ -1,6 +1,6 @@
 """The engine: frames are measured in the order of `rgbmidic.pipeline.plan`, by workers, into a sink.
 
-`rgbmidic.measure` runs it with threads or a Dask cluster and a result folder, `rgbmidic.measure_sequence` with the
+`rgbmidic.measure` runs it with threads, or workers of a tool, and a result folder, `rgbmidic.measure_sequence` with the
 latest state alone and a few initial guesses.
 """
 
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from heapq import nsmallest
 from typing import Any, Protocol
@@ -21,12 +20,12 @@ import numpy as np
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Status, TrackingState
 from rgbmidic.correlation.solution import rank
-from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
+from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.extensions import WORKERS, load_extension
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
 from rgbmidic.pipeline.order import STRIDE, is_key, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.warnings import collect_messages
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +44,24 @@ class Sink(Protocol):
 
     def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
         """Take a frame, and the initial guess of those that follow it."""
+
+
+class Workers(Protocol):
+    """Workers measure frames, several at a time: threads of the process, or a tool's."""
+
+    @property
+    def slots(self) -> int:
+        """Number of frames that are measured at a time."""
+
+    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
+        """Have one frame measured."""
+
+    def close(self) -> None:
+        """Let the workers go."""
+
+
+OpenWorkers = Callable[[Plan, str], Workers]
+"""What makes workers of a plan and the address of their scheduler."""
 
 
 class Schedule:
@@ -83,7 +100,7 @@ class Schedule:
             self._waiting.setdefault(before, []).append(position)
             self.want(before)
 
-    def run(self, workers: Threads | Cluster) -> None:
+    def run(self, workers: Workers) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
 
         Raises
@@ -207,77 +224,12 @@ class Threads:
                 cv2.setNumThreads(threads_per_frame)
 
 
-class Cluster:
-    """The workers of a Dask cluster; what a lost one was doing is done again by another."""
-
-    def __init__(self, plan: Plan, address: str) -> None:
-        distributed = import_optional("distributed", "cluster")
-        # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
-        names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
-        self._levels = {log: log.level for log in map(logging.getLogger, names)}
-        for log in self._levels:
-            log.setLevel(logging.CRITICAL + 1)
-        try:
-            self._client = distributed.Client(address, timeout=30, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=120)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ConfigurationError(f"no Dask scheduler with workers answers at {address}: {error}") from None
-        self._plan = self._client.scatter(plan, broadcast=True, hash=False)
-        self._executor = self._client.get_executor(pure=False)
-
-    @property
-    def slots(self) -> int:
-        """Threads of all workers there are now.
-
-        Raises
-        ------
-        RgbmidicError
-            The scheduler does not answer any more.
-        """
-        with _answering():
-            return max(sum(map(int, self._client.nthreads().values())), 1)
-
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
-        """Have one frame measured by some worker."""
-        with _answering():
-            future: Future[FrameOutcome] = self._executor.submit(_measure_on_cluster, self._plan, index, start, updated)
-        return future
-
-    def close(self) -> None:
-        """Leave the cluster to others, without waiting for what is not finished."""
-        self._executor.shutdown(wait=False)
-        alive = self._client.status == "running"
-        with suppress(OSError, RuntimeError, TimeoutError, CancelledError):  # a scheduler that is gone has let go of it
-            self._client.close()
-        if alive:  # else its threads complain for some time yet
-            for log, level in self._levels.items():
-                log.setLevel(level)
-
-
 LOST_CLUSTER = (
     "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with `resume=True`"
 )
+"""What a schedule reports whose workers are gone."""
 
 
-@contextmanager
-def _answering() -> Iterator[None]:
-    """Turn the errors of a scheduler that has gone into one of ours."""
-    try:
-        yield
-    except (OSError, RuntimeError, CancelledError) as error:
-        logger.debug("the Dask scheduler does not answer: %s", error)
-        raise RgbmidicError(LOST_CLUSTER) from None
-
-
-def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Threads | Cluster:
-    """A Dask cluster where its scheduler is named, else `count` threads of this process."""
-    return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
-
-
-def _measure_on_cluster(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory) -> FrameOutcome:
-    """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
-    cv2.setNumThreads(1)
-    set_threads(1)
-    with collect_messages() as messages:
-        outcome = measure_frame_safely(plan, index, start, updated)
-    return FrameOutcome(record=outcome.record, messages=tuple(messages))
+def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
+    """Workers of a cluster where its scheduler is named, else `count` threads of this process."""
+    return Threads(plan, count) if scheduler is None else load_extension(WORKERS, "dask", "scheduler")(plan, scheduler)

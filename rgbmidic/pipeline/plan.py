@@ -20,7 +20,7 @@ from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
-from rgbmidic.extensions import MESH_SOURCES, load_extension
+from rgbmidic.extensions import MESH_SOURCES, PREPARATIONS, load_extension
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
@@ -38,7 +38,6 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
-from rgbmidic.pipeline.automatic_threshold import automatic_weights
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
 from rgbmidic.pipeline.user_objects import check_user_objects
 from rgbmidic.results.quantities import MESH_DOCUMENT
@@ -232,7 +231,7 @@ class Plan:
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
         if weights is None and (settings.weights.method, settings.weights.threshold) == ("threshold", "auto"):
-            weights = automatic_weights(
+            weights = load_extension(PREPARATIONS, "weights.threshold", "weights.threshold")(
                 settings,
                 images,
                 region,
