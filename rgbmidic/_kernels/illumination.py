@@ -1,8 +1,8 @@
 """From a Bayer mosaic to channels, and from channels to lights.
 
-Of `malvar` the mosaic comes padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer phase; a
-sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the position
-of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
+`malvar` takes the mosaic padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer
+phase; a sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the
+position of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 """
 
 import numpy as np

@@ -18,16 +18,20 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation import NodeStatus, Status, TrackingState
+from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.extensions import WORKERS, load_extension
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
+from rgbmidic.pipeline.frame import ReferenceHistory, failed_frame, measure_frame_safely
 from rgbmidic.pipeline.order import STRIDE, is_key, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
+
+
+Outcome = tuple[FrameRecord, Solution | None]
+"""The record of a frame, and its solution where this process has it."""
 
 
 class Sink(Protocol):
@@ -42,7 +46,7 @@ class Sink(Protocol):
     def updated(self, positions: Sequence[int]) -> ReferenceHistory:
         """Frames that became the reference, or the reference that they make."""
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Take a frame, and the initial guess of those that follow it."""
 
 
@@ -53,7 +57,7 @@ class Workers(Protocol):
     def slots(self) -> int:
         """Number of frames that are measured at a time."""
 
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
+    def submit(self, position: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[Outcome]:
         """Have one frame measured."""
 
     def close(self) -> None:
@@ -75,7 +79,7 @@ class Schedule:
         self._plan, self._sink = plan, sink
         self._ready, self._wanted = list[tuple[int, TrackingState]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
-        self._first_tries: dict[int, FrameOutcome] = {}
+        self._first_tries: dict[int, Outcome] = {}
         for position in positions:
             self.want(position)
 
@@ -110,17 +114,17 @@ class Schedule:
         FrameError
             All files of the frames are gone.
         """
-        running: dict[Future[FrameOutcome], tuple[int, TrackingState]] = {}
+        running: dict[Future[Outcome], tuple[int, TrackingState]] = {}
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 position, start = self._next(workers.slots)
                 updated = self._sink.updated(start.reference_updates[-1:])  # all that the reference depends on
                 # a key frame looks for what has been lost; frames between key frames follow what there is
                 frame_start = replace(start, unmeasured=0.0) if is_key(position) else start
-                running[workers.submit(self._plan.series.selected[position], frame_start, updated)] = position, start
+                running[workers.submit(position, frame_start, updated)] = position, start
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 position, start = running.pop(future)
-                self._take(position, start, self._outcome(future, self._plan.series.selected[position]))
+                self._take(position, start, self._outcome(future, position))
 
     def _next(self, slots: int) -> tuple[int, TrackingState]:
         """Take the frame that is to be measured next out of those that can be.
@@ -133,34 +137,32 @@ class Schedule:
         self._ready.remove(entry)
         return entry
 
-    def _outcome(self, future: Future[FrameOutcome], index: int) -> FrameOutcome:
+    def _outcome(self, future: Future[Outcome], position: int) -> Outcome:
         """Return the outcome of a worker, or a failed frame with the reason where the worker died."""
         try:
-            outcome = future.result()
+            return future.result()
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
             reason = f"its worker died: {type(error).__name__}"
-            return FrameOutcome(record=failed_frame(self._plan, index, reason))
-        for level, text in outcome.messages:
-            logger.log(level, "%s", text)
-        return outcome
+            return failed_frame(self._plan, position, reason), None
 
-    def _take(self, position: int, start: TrackingState, outcome: FrameOutcome) -> None:
+    def _take(self, position: int, start: TrackingState, outcome: Outcome) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
-        if outcome.record.unread and (gone := self._plan.series.missing_lights()):
+        record, solution = outcome
+        if record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with `resume=True` when they are there again")
         first = self._first_tries.pop(position, None)
-        lost = outcome.record.status != Status.CONVERGED or rank_of(outcome.record)[1] > start.unmeasured + 0.01
+        lost = record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + 0.01
         if first is None and is_key(position) and lost:  # a hundredth of the nodes more than where it started from
             self._first_tries[position] = outcome
             self._start_from(position - 1, position)
             return
         if first is not None:
-            better = min(first, outcome, key=lambda item: rank_of(item.record))
-            outcome = replace(better, record=replace(better.record, values={**better.record.values, "tries": 2}))
-        initial_guess = next_start(self._plan, outcome.record.values, start)
-        self._sink.keep(position, outcome, initial_guess)
+            record, solution = min(first, outcome, key=lambda item: rank_of(item[0]))
+            record = replace(record, values={**record.values, "tries": 2})
+        initial_guess = next_start(self._plan, record.values, start)
+        self._sink.keep(position, (record, solution), initial_guess)
         self._wanted.discard(position)
         self._ready += [(item, initial_guess) for item in self._waiting.pop(position, ())]
 
@@ -196,14 +198,14 @@ class Threads:
         self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None
 
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
+    def submit(self, position: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[Outcome]:
         """Have one frame measured, at once where there is one thread."""
         if self._executor is None:
-            done: Future[FrameOutcome] = Future()
-            done.set_result(measure_frame_safely(self._plan, index, start, updated))
+            done: Future[Outcome] = Future()
+            done.set_result(measure_frame_safely(self._plan, position, start, updated))
             return done
         self._count(1)
-        future = self._executor.submit(measure_frame_safely, self._plan, index, start, updated)
+        future = self._executor.submit(measure_frame_safely, self._plan, position, start, updated)
         future.add_done_callback(lambda _: self._count(-1))
         return future
 

@@ -38,6 +38,7 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
+from rgbmidic.pipeline.lamps import LampLight
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
 from rgbmidic.pipeline.user_objects import check_user_objects
 from rgbmidic.results.quantities import MESH_DOCUMENT
@@ -124,6 +125,8 @@ class Plan:
         Whether to tell the time that each stage of a frame takes.
     process
         What the threads of a process share.
+    lamps
+        What the light of the lamps is compared with.
 
     Examples
     --------
@@ -155,6 +158,11 @@ class Plan:
     notes: Mapping[str, Any] = field(default_factory=dict)
     timings: bool = False
     process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
+    lamps: LampLight = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Take what the lamps of the frames are compared with."""
+        object.__setattr__(self, "lamps", LampLight.of(self.images.values, self.reference))
 
     @classmethod
     def from_settings(

@@ -18,8 +18,8 @@ from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.extensions import PREPARATIONS, load_extension
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
+from rgbmidic.pipeline.engine import Outcome, Schedule, next_start, open_workers, rank_of
+from rgbmidic.pipeline.frame import ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
@@ -236,22 +236,22 @@ class _ResultSink:
         return TrackingState(displacement=None)
 
     def updated(self, positions: Sequence[int]) -> ReferenceHistory:
-        """Indices and solutions of the frames that became the reference, as the folder holds them."""
+        """Positions and solutions of the frames that became the reference, as the folder holds them."""
         if not positions:
             return ()
-        mesh, lights, selected = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
         blank, updates = Solution.failed(mesh, lights, "", np.zeros(0)), []
         names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
         for position, values in zip(positions, self._store.table().iterate(names, positions), strict=True):
             arrays: dict[str, Any] = {"node_status": values["node_status"], "rigid": values["rigid"].astype(np.float64)}
             for name, columns in _OF_NODES.items():
                 arrays[name] = np.stack([values[column] for column in columns], axis=1, dtype=np.float64)
-            updates.append((selected[position], replace(blank, **arrays)))
+            updates.append((position, replace(blank, **arrays)))
         return updates
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Write a frame, and report what became of it."""
-        record, positions = outcome.record, self._positions
+        record, positions = outcome[0], self._positions
         self._store.write_frame(position, record)
         self._finished[position] = True
         if self._progress is None:

@@ -12,9 +12,10 @@ import cv2
 from rgbmidic._kernels.threads import set_threads
 from rgbmidic.correlation import TrackingState
 from rgbmidic.errors import ConfigurationError, RgbmidicError, import_optional
-from rgbmidic.pipeline.engine import LOST_CLUSTER
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, measure_frame_safely
+from rgbmidic.pipeline.engine import LOST_CLUSTER, Outcome
+from rgbmidic.pipeline.frame import ReferenceHistory, measure_frame_safely
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.results import FrameRecord
 from rgbmidic.results.warnings import collect_messages
 
 logger = logging.getLogger(__name__)
@@ -50,11 +51,23 @@ class Cluster:
         with _answering():
             return max(sum(map(int, self._client.nthreads().values())), 1)
 
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
-        """Have one frame measured by some worker."""
+    def submit(self, position: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[Outcome]:
+        """Have one frame measured by some worker; what it logged is logged here."""
+        outcome: Future[Outcome] = Future()
+
+        def report(of_worker: Future[tuple[FrameRecord, list[tuple[int, str]]]]) -> None:
+            try:
+                record, messages = of_worker.result()
+            except (CancelledError, Exception) as error:
+                outcome.set_exception(error)
+                return
+            for level, text in messages:
+                logger.log(level, "%s", text)
+            outcome.set_result((record, None))
+
         with _answering():
-            future: Future[FrameOutcome] = self._executor.submit(_measure_on_cluster, self._plan, index, start, updated)
-        return future
+            self._executor.submit(_measure, self._plan, position, start, updated).add_done_callback(report)
+        return outcome
 
     def close(self) -> None:
         """Leave the cluster to others, without waiting for what is not finished."""
@@ -77,10 +90,12 @@ def _answering() -> Iterator[None]:
         raise RgbmidicError(LOST_CLUSTER) from None
 
 
-def _measure_on_cluster(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory) -> FrameOutcome:
-    """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
+def _measure(
+    plan: Plan, position: int, start: TrackingState, updated: ReferenceHistory
+) -> tuple[FrameRecord, list[tuple[int, str]]]:
+    """Measure a frame in a worker, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
     with collect_messages() as messages:
-        outcome = measure_frame_safely(plan, index, start, updated)
-    return FrameOutcome(record=outcome.record, messages=tuple(messages))
+        record, _ = measure_frame_safely(plan, position, start, updated)
+    return record, messages
