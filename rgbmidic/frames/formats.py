@@ -15,10 +15,10 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.extensions import FRAME_FORMATS
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.images import HeaderlessFile, PngFile
 from rgbmidic.frames.metadata import CameraMetadata
-from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
+from rgbmidic.frames.source import FrameSource, split_dataset
+from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile
 from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
@@ -77,6 +77,11 @@ class FrameFormat:
         return self.recognises(path, user_metadata)
 
 
+def _is_headerless(path: Path, user_metadata: FrameSettings) -> bool:
+    """Return whether a file has no header: .bin, and .raw whose shape is stated, as some cameras' .raw have one."""
+    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and user_metadata.shape is not None)
+
+
 def _is_tiff(path: Path, _: FrameSettings) -> bool:
     return path.suffix.lower() in TIFF_ENDINGS and not is_dng(path)
 
@@ -89,7 +94,7 @@ FORMATS = (
     FrameFormat(
         name="headerless .raw and .bin files whose shape and dtype are stated",
         endings=(".raw", ".bin"),
-        recognises=is_headerless,
+        recognises=_is_headerless,
         source=HeaderlessFile,
     ),
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
@@ -116,9 +121,9 @@ ENTRY_POINTS = "rgbmidic.frame_formats"
 
 
 @cache
-def _plugin_formats() -> tuple[FrameFormat, ...]:
-    """Return the formats of other packages; one that cannot be loaded is left out with a warning."""
-    formats = list[FrameFormat]()
+def _added_formats() -> tuple[FrameFormat, ...]:
+    """Return the formats of tools and of other packages; one that cannot be loaded is left out with a warning."""
+    formats = [frame_format for load in FRAME_FORMATS.values() for frame_format in load()]
     for point in entry_points(group=ENTRY_POINTS):
         try:
             frame_format = point.load()
@@ -142,7 +147,7 @@ def frame_formats() -> tuple[FrameFormat, ...]:
     >>> any(".dng" in frame_format.endings for frame_format in frame_formats())
     True
     """
-    return (*FORMATS, *(entry for formats in FRAME_FORMATS.values() for entry in formats()), *_plugin_formats())
+    return (*FORMATS, *_added_formats())
 
 
 _MOVIE = "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern"

@@ -32,7 +32,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.demosaicing import TILE, fill_unknown, predict, prediction_taps
 from rgbmidic._kernels.illumination import PAD, malvar
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import cfa_channels, sampled_channels
+from rgbmidic.frames.data import sampled_channels
 from rgbmidic.illumination.colour_factors import (
     BLOCK,
     CHANNEL,
@@ -59,8 +59,8 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 def red_position(cfa: str) -> tuple[int, int]:
     """Return row and column of red in the 2x2 cell of a Bayer pattern."""
-    row, column = np.argwhere(cfa_channels(cfa) == 0)[0]
-    return int(row), int(column)
+    row, column = divmod(cfa.index("R"), 2)
+    return row, column
 
 
 def malvar_demosaic(mosaic: LinearMosaic) -> LinearChannels:
@@ -153,14 +153,15 @@ class Reconstruction:
             return LinearChannels(values=values, valid=_mixed_validity(channels.valid, mixing), full_scale=full_scale)
         rows, columns = shape = self.mosaic.values.shape
         index, taps, size = self._filters(self.factors.light_specific, tables=tables)
-        padded, pad = self._contrast(index.shape[1], size), size // 2
+        spread, pad = self.factors.spread, size // 2
+        padded = self._contrast(spread, index.shape[1], size)
         out, valid = np.empty((len(mixing), *shape), dtype=np.float32), np.ones((len(mixing), *shape), dtype=bool)
         if self.mosaic.saturated.any():
             source, unknown = padded.copy(), np.zeros(padded.shape, dtype=bool)
             fill_unknown(source, _per_tile(1 / (1 + self.factors.specific)), *self.moments.red, pad, padded, unknown)
             unknown = unknown[pad : pad + rows, pad : pad + columns]
             valid = _mixed_validity(_validity(self.mosaic.saturated, unknown, self.mosaic.cfa), mixing)
-        scale = upsample_rows(self.factors.spread, BLOCK, columns)
+        scale = upsample_rows(spread, BLOCK, columns)
         mean = upsample_rows(self.moments.channel_mean, MEAN_BLOCK, columns)
         predict(padded, index, taps, size, scale, BLOCK, mean, MEAN_BLOCK, mixing.astype(np.float32), out)
         return LinearChannels(values=out, valid=valid, full_scale=full_scale)
@@ -177,7 +178,8 @@ class Reconstruction:
     def _left_out_error(self, specific: FloatArray) -> float:
         """Mean square error of samples that are left out, each over its channel's variance."""
         index, taps, size = self._filters(specific, left_out=True)
-        padded, pad, (rows, columns) = self._contrast(index.shape[1], size), size // 2, self.mosaic.values.shape
+        padded, pad = self._contrast(self.factors.spread, index.shape[1], size), size // 2
+        rows, columns = self.mosaic.values.shape
         unit_scale, zero_mean = (np.full((3, 1, columns), level, np.float32) for level in (1, 0))
         out = np.empty((3, rows, columns), dtype=np.float32)
         predict(padded, index, taps, size, unit_scale, rows, zero_mean, rows, np.eye(3, dtype=np.float32), out)
@@ -197,10 +199,10 @@ class Reconstruction:
         tables, fraction = tables or FilterTables(), self.factors.light_fraction
         return tables.find(codes, self.texture, self.mosaic.cfa, fraction, left_out=left_out)
 
-    def _contrast(self, tiles: int, size: int) -> FloatImage:
+    def _contrast(self, spread: FloatArray, tiles: int, size: int) -> FloatImage:
         """Return the samples' contrast over its spread, padded for filters of a side; NaN where saturated."""
-        spread = self.factors.spread.astype(np.float32)
-        return normalise_contrast(self.moments, np.float32(1) / spread, pad=size // 2, width=tiles * TILE)
+        scale = np.float32(1) / spread.astype(np.float32)
+        return normalise_contrast(self.moments, scale, pad=size // 2, width=tiles * TILE)
 
 
 def reconstruct(
@@ -465,9 +467,8 @@ def _filters(
 
 def _site_kinds(cfa: str) -> npt.NDArray[np.int64]:
     """Return the kinds of site (`CHANNEL`) of the 2x2 cell of a pattern."""
-    channels = cfa_channels(cfa)
-    red_row = (channels == 0).any(axis=1, keepdims=True)
-    return np.where(channels == 1, np.where(red_row, 1, 2), channels + (channels == 2)).astype(np.int64)
+    rows = cfa[:2], cfa[2:]
+    return np.array([[{"R": 0, "G": 1 if "R" in row else 2, "B": 3}[colour] for colour in row] for row in rows])
 
 
 def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, float, FloatArray]:

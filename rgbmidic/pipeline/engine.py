@@ -153,8 +153,7 @@ class Schedule:
         if record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with `resume=True` when they are there again")
         first = self._first_tries.pop(position, None)
-        lost = record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + 0.01
-        if first is None and is_key(position) and lost:  # a hundredth of the nodes more than where it started from
+        if first is None and is_key(position) and self._has_lost(record, start):
             self._first_tries[position] = outcome
             self._start_from(position - 1, position)
             return
@@ -165,6 +164,11 @@ class Schedule:
         self._sink.keep(position, (record, solution), initial_guess)
         self._wanted.discard(position)
         self._ready += [(item, initial_guess) for item in self._waiting.pop(position, ())]
+
+    @staticmethod
+    def _has_lost(record: FrameRecord, start: TrackingState) -> bool:
+        """Tell whether a frame is not measured well: a hundredth of the nodes more lost than where it started from."""
+        return record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + 0.01
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:

@@ -541,7 +541,7 @@ def test_formats_of_other_packages_join_by_an_entry_point(
         for name, what in (("level", "level"), ("gone", "not_there"), ("other", "NO_FORMAT"))
     ]
     monkeypatch.setattr(formats, "entry_points", lambda group: [one for one in points if one.group == group])
-    formats._plugin_formats.cache_clear()
+    formats._added_formats.cache_clear()
     try:
         for number in (7, 8):
             (tmp_path / f"{number}.level").write_text(str(number))
@@ -557,4 +557,4 @@ def test_formats_of_other_packages_join_by_an_entry_point(
         assert "not_there" in warnings[0]
         assert "it is a tuple, not a rgbmidic.frames.FrameFormat" in warnings[1]
     finally:
-        formats._plugin_formats.cache_clear()
+        formats._added_formats.cache_clear()
