@@ -1,7 +1,11 @@
-"""The engine: frames are measured in the order of `rgbmidic.pipeline.plan`, by workers, into a sink.
+"""The engine: frames are measured by workers, each as soon as the frame that it starts from is there, into a sink.
 
-`rgbmidic.measure` runs it with threads, or workers of a tool, and a result folder, `rgbmidic.measure_sequence` with the
-latest state alone and a few initial guesses.
+The frames are the leaves of a tree of base `STRIDE`, whatever the number of workers: a frame starts from the one before
+it, every 16th from the 16th before, every 256th from the 256th before, and so on, so that chunks of consecutive frames
+can be measured side by side once their key frame is, and any range of frames needs only some key frames of those before
+it. A key frame that is not measured well from there is measured once more from the frame just before it, and the better
+of both is kept. `rgbmidic.measure` runs it with threads, or workers of a tool, and a result folder,
+`rgbmidic.measure_sequence` with the latest state alone and a few initial guesses.
 """
 
 from __future__ import annotations
@@ -23,11 +27,37 @@ from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.extensions import WORKERS, load_extension
 from rgbmidic.pipeline.frame import ReferenceHistory, failed_frame, measure_frame_safely
-from rgbmidic.pipeline.order import STRIDE, is_key, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
+
+
+def parent(position: int) -> int | None:
+    """The frame that a frame starts from; None for the first."""
+    if position == 0:
+        return None
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return position - step
+
+
+def is_key(position: int) -> bool:
+    """Return whether a frame starts from one that is not just before it."""
+    return position > 0 and position % STRIDE == 0
+
+
+def dependants(positions: Iterable[int], tries: Sequence[int]) -> set[int]:
+    """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
+
+    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
+    """
+    affected = set(positions)
+    for position, try_count in enumerate(tries):
+        if parent(position) in affected or (try_count > 1 and position - 1 in affected):
+            affected.add(position)
+    return affected
 
 
 Outcome = tuple[FrameRecord, Solution | None]

@@ -41,8 +41,7 @@ from rgbmidic.pipeline.frame_quality import (
     unsteady,
 )
 from rgbmidic.pipeline.lamps import LEAST_GAIN, dimmed_lights
-from rgbmidic.pipeline.order import STRIDE, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatImage
@@ -331,7 +330,7 @@ def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
 def _blur_warning(plan: Plan, position: int, start: TrackingState, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
     if (
-        parent(position) != position - 1
+        position % STRIDE == 0  # a key frame
         or start.displacement is None
         or not solution.measured.any()
         or not plan.exposure

@@ -39,8 +39,7 @@ from rgbmidic.illumination.separation import (
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
 from rgbmidic.pipeline.lamps import LampLight
-from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
-from rgbmidic.pipeline.user_objects import check_user_objects
+from rgbmidic.pipeline.user_objects import FrameSequence, Series, check_user_objects, open_frames
 from rgbmidic.results.quantities import MESH_DOCUMENT
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
@@ -49,6 +48,8 @@ from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
 
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 

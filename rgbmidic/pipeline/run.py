@@ -18,13 +18,11 @@ from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.extensions import PREPARATIONS, load_extension
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.engine import Outcome, Schedule, next_start, open_workers, rank_of
+from rgbmidic.pipeline.engine import Outcome, Schedule, dependants, next_start, open_workers, rank_of
 from rgbmidic.pipeline.frame import ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
-from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.source import FrameSequence
-from rgbmidic.pipeline.user_objects import check_object, check_type, describe
+from rgbmidic.pipeline.user_objects import FrameSequence, check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM

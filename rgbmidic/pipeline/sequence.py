@@ -36,8 +36,7 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Outcome, Schedule, Threads
 from rgbmidic.pipeline.frame import messages, next_reference
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.pipeline.user_objects import check_object, check_type
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
