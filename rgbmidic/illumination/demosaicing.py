@@ -54,6 +54,7 @@ from rgbmidic.illumination.displacement import LightDisplacement, light_displace
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import COLOURED, TextureModel
+from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -153,8 +154,8 @@ class Reconstruction:
             return LinearChannels(values=values, valid=_mixed_validity(channels.valid, mixing), full_scale=full_scale)
         rows, columns = shape = self.mosaic.values.shape
         index, taps, size = self._filters(self.factors.light_specific, tables=tables)
-        spread, pad = self.factors.spread, size // 2
-        padded = self._contrast(spread, index.shape[1], size)
+        spread, pad = self.factors.spread.astype(np.float32), size // 2
+        padded = normalise_contrast(self.moments, np.float32(1) / spread, pad=pad, width=index.shape[1] * TILE)
         out, valid = np.empty((len(mixing), *shape), dtype=np.float32), np.ones((len(mixing), *shape), dtype=bool)
         if self.mosaic.saturated.any():
             source, unknown = padded.copy(), np.zeros(padded.shape, dtype=bool)
@@ -178,8 +179,9 @@ class Reconstruction:
     def _left_out_error(self, specific: FloatArray) -> float:
         """Mean square error of samples that are left out, each over its channel's variance."""
         index, taps, size = self._filters(specific, left_out=True)
-        padded, pad = self._contrast(self.factors.spread, index.shape[1], size), size // 2
+        spread, pad = self.factors.spread.astype(np.float32), size // 2
         rows, columns = self.mosaic.values.shape
+        padded = normalise_contrast(self.moments, np.float32(1) / spread, pad=pad, width=index.shape[1] * TILE)
         unit_scale, zero_mean = (np.full((3, 1, columns), level, np.float32) for level in (1, 0))
         out = np.empty((3, rows, columns), dtype=np.float32)
         predict(padded, index, taps, size, unit_scale, rows, zero_mean, rows, np.eye(3, dtype=np.float32), out)
@@ -198,11 +200,6 @@ class Reconstruction:
         codes = filter_codes(_per_tile(specific), noise, displacement, self.glints)
         tables, fraction = tables or FilterTables(), self.factors.light_fraction
         return tables.find(codes, self.texture, self.mosaic.cfa, fraction, left_out=left_out)
-
-    def _contrast(self, spread: FloatArray, tiles: int, size: int) -> FloatImage:
-        """Return the samples' contrast over its spread, padded for filters of a side; NaN where saturated."""
-        scale = np.float32(1) / spread.astype(np.float32)
-        return normalise_contrast(self.moments, scale, pad=size // 2, width=tiles * TILE)
 
 
 def reconstruct(
@@ -242,8 +239,9 @@ def reconstruct(
         )
     if mosaic.saturated.any():
         values = np.where(mosaic.saturated, np.float32(np.nan), values)
-    model, fitted_texture = MosaicModel.of(crosstalk, registration, values.shape), texture
-    gather = partial(gather_moments, values, red_position(mosaic.cfa), mosaic.noise, model)
+    red, fitted_texture = red_position(mosaic.cfa), texture
+    model = MosaicModel.of(crosstalk, registration, values.shape)
+    gather = partial(gather_moments, values, red, mosaic.noise, model)
     moments = gather(texture)
     if fitted_texture is None:
         fitted_texture = learn_texture(moments, model)
@@ -315,6 +313,11 @@ a droplet's flank is not the displaced texture alone. With 2 and 4 the error on 
 degrees (benchmarks/reflections.py)."""
 LEFT_OUT = 1e6
 """Variance of the noise with which a sample is left out."""
+SITE_KINDS = {
+    cfa: np.array([[{"R": 0, "G": 2 - ("R" in row), "B": 3}[colour] for colour in row] for row in (cfa[:2], cfa[2:])])
+    for cfa in BAYER_PATTERNS
+}
+"""Kinds of site (`CHANNEL`) of the 2x2 cell of each pattern."""
 MOST_FILTERS = 16_384
 """Filters that a table keeps (20 MB): those of 16 frames of a megapixel that share none."""
 
@@ -445,7 +448,7 @@ def _filters(
     spread = np.sqrt(1 + variance @ (channel_means(light_fraction) ** 2).T)
     glints = STEP * glint.reshape(-1, lights, 2)
     offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
-    cell = _site_kinds(cfa)
+    cell = SITE_KINDS[cfa]
     taps = np.empty((len(codes), 4, 3, size, size))
     prediction_taps(
         np.ascontiguousarray(light_fraction, dtype=np.float64),
@@ -463,12 +466,6 @@ def _filters(
     )
     by_parity = taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2)
     return np.ascontiguousarray(by_parity, dtype=np.float32)
-
-
-def _site_kinds(cfa: str) -> npt.NDArray[np.int64]:
-    """Return the kinds of site (`CHANNEL`) of the 2x2 cell of a pattern."""
-    rows = cfa[:2], cfa[2:]
-    return np.array([[{"R": 0, "G": 1 if "R" in row else 2, "B": 3}[colour] for colour in row] for row in rows])
 
 
 def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, float, FloatArray]:

@@ -148,7 +148,8 @@ class Schedule:
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 position, start = self._next(workers.slots)
-                updated = self._sink.updated(start.reference_updates[-1:])  # all that the reference depends on
+                last = start.reference_updates[-1:]  # all that the reference depends on
+                updated = self._sink.updated(last) if last else ()
                 # a key frame looks for what has been lost; frames between key frames follow what there is
                 frame_start = replace(start, unmeasured=0.0) if is_key(position) else start
                 running[workers.submit(position, frame_start, updated)] = position, start
