@@ -55,7 +55,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "IlluminationImages": {"placed": "with_origin"},
     "Inspection": {"hidden": "lacks_contrast", "unmeasured": "unmeasured_fraction"},
     "Result": {**_STRAIN, "strain": "nodal_strain", "strain_std": "nodal_strain_std", "each": "iterate"},
-    "FrameRecord": {**_STRAIN, "of": "from_values", "from_solution": "from_measurement"},
+    "FrameRecord": {**_STRAIN, "of": "from_values"},
     "Maps": {
         "of": "from_result",
         "all": "quantities",

@@ -537,15 +537,14 @@ def warp_arguments(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tupl
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
-    initial_weights = np.ones_like(images) if weights is None else weights
-    usable, reach = np.zeros_like(images), usable_reach(prefilter)
-    for image, weight, out in zip(images, initial_weights, usable, strict=True):
+    usable, reach = np.ones_like(images) if weights is None else weights.copy(), usable_reach(prefilter)
+    for image, weight in zip(images, usable, strict=True):
         if weight.min() > 0 and np.isfinite(image.sum()):  # NaN and infinity spread to it
-            out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
+            weight[:reach] = weight[-reach:] = weight[:, :reach] = weight[:, -reach:] = 0
         else:
             valid = np.isfinite(image)
             valid &= weight > 0
-            cv2.copyTo(weight, usable_pixels(valid, prefilter).view(np.uint8), out)
+            weight[~usable_pixels(valid, prefilter)] = 0
     return usable
 
 

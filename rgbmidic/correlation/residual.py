@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import ELEMENTS, GainFit, gain_and_offset, inverse_gains
+from rgbmidic.correlation.brightness import GainFit, inverse_gains
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
@@ -238,60 +238,6 @@ def curved_deviation(
     deviation = sag.transpose(0, 2, 1) @ products
     deviation[..., :3] -= nodal_offset[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
-
-
-_MIN_PIXELS = 12
-"""Pixels of an element that must be known in both states: a contrast of 12 values is known to 20 % (derived)."""
-
-
-def brightness_change(
-    first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
-) -> FloatArray:
-    """Return gain and offset of every light, ``second = gain first + offset``, between two states in grey levels.
-
-    They are those of `gain_and_offset`, whatever the solve takes of them, against the first reference, and of a lamp
-    that is off, too: the gain is what the lamp gives, the offset what the mean has beyond that (reflections, stray
-    light) in the middle of the elements.
-
-    Parameters
-    ----------
-    first, second : ndarray, shape (k, H, W)
-        Images of the two states in grey levels, of one size or not; NaN where unknown.
-    reference
-        Mesh and pixels of the reference state.
-    displacement : ndarray, shape (N, 2)
-        Of the nodes in px, from their place in the first images to that in the second; elements with a node that is NaN
-        are left out.
-
-    Returns
-    -------
-    ndarray, shape (k, 2)
-        Gain and offset (grey levels); NaN where no element is seen in both states.
-    """
-    mesh, pixels, sample_count = reference.mesh, reference.pixels, 36  # a contrast of 36 pixels is known to 12 %
-    elements = np.arange(0, len(mesh.elements), 1 + len(mesh.elements) // ELEMENTS)
-    motion, size = displacement[mesh.elements[elements]].mean(axis=1), np.diff(pixels.offsets)[elements]
-    usable = np.isfinite(motion).all(axis=1) & (size >= _MIN_PIXELS)
-    if not usable.any():
-        return np.full((len(first), 2), np.nan)
-    elements, step, size = elements[usable], np.round(motion[usable]).astype(np.int64), size[usable]
-    slots = pixels.offsets[elements, None] + np.arange(sample_count) * size[:, None] // sample_count
-    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[elements, :1]
-    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[elements, 1:]
-    height, width = second.shape[1:]
-    across, down = columns + step[:, :1], rows + step[:, 1:]
-    inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
-    f = first[:, rows, columns].astype(np.float64)
-    g = second[:, np.clip(down, 0, height - 1), np.clip(across, 0, width - 1)].astype(np.float64)
-    valid = inside & np.isfinite(f) & np.isfinite(g)
-    valid &= valid.sum(axis=-1, keepdims=True) >= _MIN_PIXELS
-    f, g = np.where(valid, f, 0), np.where(valid, g, 0)
-    moments = np.stack(
-        [valid.sum(axis=-1), *(product.sum(axis=-1) for product in (f, g, f * f, f * g, g * g))], axis=-1
-    )
-    centres = mesh.centres[elements]
-    gain, offset = gain_and_offset(moments, centres - centres.mean(axis=0), -1.0)
-    return np.stack([gain, np.where(np.isfinite(gain), offset[:, 0], np.nan)], axis=1)
 
 
 _FITTED_PAIRS = 12

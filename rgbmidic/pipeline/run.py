@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from itertools import chain
@@ -15,17 +15,14 @@ import numpy as np
 from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.errors import FrameError, InputError, ResultError
+from rgbmidic.extensions import PREPARATIONS, load_extension
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
+from rgbmidic.pipeline.engine import Outcome, Schedule, dependants, next_start, open_workers, rank_of
+from rgbmidic.pipeline.frame import ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
-from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.refinement import refine
-from rgbmidic.pipeline.resolution import choose
-from rgbmidic.pipeline.source import FrameSequence
-from rgbmidic.pipeline.user_objects import check_object, check_type, describe
+from rgbmidic.pipeline.user_objects import FrameSequence, check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
@@ -192,7 +189,9 @@ def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: M
     """Make the plan of a test: elements and mesh are those of the `provenance` of a result that is gone on with."""
     sized, notes = settings.mesh, dict[str, Any]()
     if sized.element_size == "auto":
-        choice = notes["element_size"] = provenance.get("element_size") or asdict(choose(settings, **instances))
+        choice = notes["element_size"] = provenance.get("element_size") or asdict(
+            _prepare("mesh.element_size")(settings, **instances)
+        )
         sized = replace(sized, element_size=choice["element_size"])
     refines = settings.mesh.refine is not False
     if refines and instances["mesh"] is not None:
@@ -203,8 +202,13 @@ def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: M
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
         plan, notes["refinement"] = plan.on_mesh(finer), provenance["refinement"]
     elif refines:
-        plan = refine(plan, settings.mesh.refine)
+        plan = _prepare("mesh.refine")(plan, settings.mesh.refine)
     return replace(plan, settings=settings, notes={**plan.notes, **notes})
+
+
+def _prepare(key: str) -> Callable[..., Any]:
+    """Return what finds the value of a key of TEST.toml on the test's own frames."""
+    return load_extension(PREPARATIONS, key, key)
 
 
 class _ResultSink:
@@ -230,22 +234,22 @@ class _ResultSink:
         return TrackingState(displacement=None)
 
     def updated(self, positions: Sequence[int]) -> ReferenceHistory:
-        """Indices and solutions of the frames that became the reference, as the folder holds them."""
+        """Positions and solutions of the frames that became the reference, as the folder holds them."""
         if not positions:
             return ()
-        mesh, lights, selected = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
         blank, updates = Solution.failed(mesh, lights, "", np.zeros(0)), []
         names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
         for position, values in zip(positions, self._store.table().iterate(names, positions), strict=True):
             arrays: dict[str, Any] = {"node_status": values["node_status"], "rigid": values["rigid"].astype(np.float64)}
             for name, columns in _OF_NODES.items():
                 arrays[name] = np.stack([values[column] for column in columns], axis=1, dtype=np.float64)
-            updates.append((selected[position], replace(blank, **arrays)))
+            updates.append((position, replace(blank, **arrays)))
         return updates
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Write a frame, and report what became of it."""
-        record, positions = outcome.record, self._positions
+        record, positions = outcome[0], self._positions
         self._store.write_frame(position, record)
         self._finished[position] = True
         if self._progress is None:

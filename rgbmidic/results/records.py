@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -32,7 +32,7 @@ from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
+from rgbmidic.typing import BoolArray, IntArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -79,36 +79,6 @@ class QuantityAttributes:
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measurement:
-    """A solved frame: its solution, and the quantities without a `ResultQuantity.source` by their names.
-
-    Attributes
-    ----------
-    solution
-        Displacement and all that the solve gives.
-    number, time_ns, brightness, match, best_match, reference_updates, weights_thumbnail, reflection_thumbnail, seconds
-        See `QUANTITIES`; None where not known.
-    inputs
-        SHA-256 of each file that the frame was read from, by its path.
-    """
-
-    solution: Solution
-    number: int
-    time_ns: int | None
-    warnings: Sequence[str]
-    inputs: Mapping[str, str]
-    machine: str
-    checksum: int
-    match: float
-    best_match: float
-    reference_updates: Sequence[int]
-    brightness: FloatArray
-    weights_thumbnail: AnyArray
-    reflection_thumbnail: AnyArray | None
-    seconds: Sequence[float] | None = None
 
 
 @state_new_names
@@ -169,26 +139,26 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
         return cls(values=blank | quantities, sizes=sizes)
 
     @classmethod
-    def from_measurement(cls, measurement: Measurement) -> FrameRecord:
+    def from_solution(cls, solution: Solution, **quantities: Any) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
-        measurement
-            Its solution, from which the quantities that have a `ResultQuantity.source` are taken, and the others.
+        solution
+            From which the quantities that have a `ResultQuantity.source` are taken.
+        **quantities
+            The others, as in `from_values`.
 
         Returns
         -------
         FrameRecord
         """
-        values = {field.name: getattr(measurement, field.name) for field in fields(measurement)}
-        solution: Solution = values.pop("solution")
         nodes, lights = np.shape(solution.light_fraction)
         has_error = np.isfinite(solution.displacement_error).any()
         for entry in QUANTITIES.values():
             if entry.source and (has_error or not entry.is_estimated):
-                values[entry.name] = entry.read_from(solution)
-        return cls.from_values(nodes=nodes, lights=lights, **values)
+                quantities[entry.name] = entry.read_from(solution)
+        return cls.from_values(nodes=nodes, lights=lights, **quantities)
 
     @classmethod
     def failed(cls, reason: str, *, nodes: int, lights: int, **quantities: Any) -> FrameRecord:

@@ -164,7 +164,7 @@ class MeshSettings(CheckedSettings):
     ----------
     element_size
         Side of the elements in px, 25 where none is stated; ``"auto"``: what a study of the test's own frames
-        recommends (`rgbmidic.pipeline.resolution`); None with `file`, which has its own.
+        recommends (`rgbmidic.tools.preparation.element_size`); None with `file`, which has its own.
     cracks
         Paths, each of corners (x, y) in px on the reference, along which the mesh is split.
     file
@@ -180,7 +180,7 @@ class MeshSettings(CheckedSettings):
         frames (``"key"``): every 16th and the last.
     refine
         Whether elements are bisected where the discretisation error of strain is more than twice its noise
-        (`rgbmidic.pipeline.refinement.refine`), in the frame of this index, or in a key frame (True).
+        (`rgbmidic.tools.preparation.refinement.refine`), in the frame of this index, or in a key frame (True).
 
     Examples
     --------

@@ -223,7 +223,7 @@ def _frame_label(physical: ResultInUnits, frame: int) -> str:
 
 
 def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> None:
-    """Write the table of a batch (`rgbmidic.pipeline.batch.summary_rows`) as a page with links to the tests' reports.
+    """Write the table of a batch (`rgbmidic.tools.batch.summary_rows`) as a page with links to the tests' reports.
 
     Parameters
     ----------

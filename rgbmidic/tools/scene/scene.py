@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rgbmidic._kernels import render as kernels
 from rgbmidic.arguments import bounded, check_fields
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.settings import (
@@ -24,7 +23,7 @@ from rgbmidic.settings import (
     read_toml,
     require_regular_file,
 )
-from rgbmidic.tools.scene import SceneSection
+from rgbmidic.tools.scene import SceneSection, kernels
 from rgbmidic.tools.scene.camera import (
     PIXEL,
     REFERENCE_CROSSTALK,

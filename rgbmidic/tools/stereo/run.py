@@ -24,7 +24,7 @@ from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
-from rgbmidic.pipeline.source import Series, open_frames
+from rgbmidic.pipeline.user_objects import Series, open_frames
 from rgbmidic.results import Result, common_variance_fraction, frame_times
 from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result

@@ -13,8 +13,8 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refine_elements
 from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.resolution import KeyFrame, solved
-from rgbmidic.pipeline.size_figures import CONSTANTS
+from rgbmidic.tools.preparation.element_size import KeyFrame, solved
+from rgbmidic.tools.preparation.size_figures import CONSTANTS
 
 logger = logging.getLogger(__name__)
 
