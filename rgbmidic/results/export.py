@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import column
 from rgbmidic.fields.quantity import ResultQuantity
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import Displacement, Field, FieldSource
 from rgbmidic.fields.history import Probe, rate_frames, rate_words, rates
@@ -25,7 +26,6 @@ from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import format_value

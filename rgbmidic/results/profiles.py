@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.history import rate_correlation
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.result_in_units import frame_times
 from rgbmidic.typing import AnyArray, FloatArray

@@ -25,12 +25,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from rgbmidic.disk import npy_array, npy_bytes, require_regular_file, write_complete
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
-from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import read_arrays, read_json, write_json
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.extensions import RESULTS
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import (
     PROVENANCE,
     RESTORE_REMEDY,

@@ -20,6 +20,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.frames.names import NamedFiles
@@ -28,7 +29,7 @@ from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import rectification_of
-from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings
 from rgbmidic.tools.finite_elements.files import read_mesh
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
 from rgbmidic.tools.finite_elements.mesh_source import placement_of

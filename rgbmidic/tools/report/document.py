@@ -12,9 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.disk import check_file, write_text
 from rgbmidic.errors import InputError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
-from rgbmidic.results.files import check_file, write_text
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings

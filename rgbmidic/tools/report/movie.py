@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete
 from rgbmidic.errors import InputError, ResultError, RgbmidicError, import_optional
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results import QUANTITIES, Maps, ResultQuantity, frame_times
-from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.curves import Curve
 from rgbmidic.tools.report.figures import field_colours, picture_limits, select_evenly

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rgbmidic.disk import write_complete
 from rgbmidic.errors import InputError
-from rgbmidic.results.files import write_complete
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Self
 
 import numpy as np
 
+from rgbmidic.disk import write_table
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.field import column
 from rgbmidic.results import Result, ResultQuantity
-from rgbmidic.results.files import write_table
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES, SCHEMA, SHARED, STEREO_FILE, VERSION, dimensions
 from rgbmidic.typing import AnyArray, FloatArray
 

@@ -23,9 +23,9 @@ import pytest
 from damage import damage_results, write_result
 from results import corrupt, make_result, random_record
 
+from rgbmidic.disk import check_file, npy_bytes
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result, finish_result, records
-from rgbmidic.results.files import check_file, npy_bytes
 from rgbmidic.results.provenance import fingerprint
 from rgbmidic.results.records import FrameTable
 from rgbmidic.typing import AnyArray
