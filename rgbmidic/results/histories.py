@@ -23,8 +23,8 @@ from rgbmidic.field import Displacement, Field, FieldSource
 from rgbmidic.fields.history import Probe, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
 from rgbmidic.fields.probes import make_probe
+from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import EQUIVALENT
-from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings

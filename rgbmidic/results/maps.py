@@ -19,9 +19,8 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
-from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.quantity import ResultQuantity, Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
-from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.quantities import UNKNOWN_TIME, UV, map_quantities
@@ -252,7 +251,7 @@ class Maps(Portable):
         -------
         ndarray, shape (N, 2)
         """
-        record = next(self.result.table.iterate(UV, [frame]))
+        record = self.result.table.read(frame, UV)
         return np.asarray(self.result.nodes + np.stack([record[name] for name in UV], axis=1))
 
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
@@ -447,7 +446,7 @@ class Maps(Portable):
     def _units(self) -> Units:
         """Units with that of time, for which one frame is read: `_clock` reads all."""
         first_stamp = next(iter(self.result.iterate("time_ns", self._measured_frames[:1])), UNKNOWN_TIME)
-        scale = self.physical.scale or self.result.section(ScaleSettings)
+        scale = self.physical.scale or self.result.scale
         rate = scale.frame_rate or self.result.provenance.get("frame_rate")
         return replace(self.physical.units, timed=bool(rate) or first_stamp != UNKNOWN_TIME)
 

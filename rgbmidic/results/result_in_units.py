@@ -21,9 +21,8 @@ from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
-from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.quantity import ResultQuantity, Units
 from rgbmidic.fields.strain import MEASURES, STRAIN, TENSOR, StrainGauges, unchecked_strain
-from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.quantities import (
     DERIVED,
@@ -33,6 +32,7 @@ from rgbmidic.results.quantities import (
     QUANTITIES,
     STRAIN_COLUMNS,
     UNKNOWN_TIME,
+    UV,
     stored_map_quantities,
 )
 from rgbmidic.results.result import Portable, Result
@@ -66,10 +66,10 @@ def rectification_of(
     InputError
         The camera holds no plane.
     """
-    effective_scale, camera = result.section(ScaleSettings) if scale is None else scale, None
-    effective_scale = replace(effective_scale, unit=unit or effective_scale.unit)
-    if effective_scale.unit == "px":
-        effective_scale = replace(effective_scale, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
+    stated, camera = result.scale if scale is None else scale, None
+    units = Units(mm_per_pixel=stated.mm_per_pixel, mm_per_pixel_std=stated.mm_per_pixel_std)
+    if (unit or stated.unit) == "px":
+        units = Units()
     elif scale is None:
         camera = stored_camera(result)
     elif scale.camera is not None:
@@ -77,24 +77,31 @@ def rectification_of(
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
     elif (
-        effective_scale.unit == "mm"
-        and effective_scale.mm_per_pixel is None
+        (unit or stated.unit) == "mm"
+        and units.mm_per_pixel is None
         and "camera" not in result.provenance
         and (document := result.provenance.get(MESH_DOCUMENT)) is not None
     ):
         mm_per_pixel, std = load_extension(MESH_SOURCES, MESH_DOCUMENT, "the mesh of the result").scale(document)
-        effective_scale = replace(effective_scale, mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
-    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), effective_scale, camera)
+        units = Units(mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
+    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), units, camera)
 
 
 def stored_camera(result: Result) -> CameraCalibration | None:
     """Return the camera that the ``[scale]`` of a result names, as its provenance holds it; None: none."""
     document = result.provenance.get("camera")
-    return (
-        None
-        if document is None
-        else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
-    )
+    return None if document is None else CameraCalibration.from_document(document, str(result.scale.camera))
+
+
+def frame_rate(result: Result, scale: ScaleSettings | None = None) -> tuple[float | None, str]:
+    """Return the frame rate of a test and where it is from: that of ``[scale]`` before the camera's.
+
+    Frames that have time stamps do not follow the ``[scale]``.
+    """
+    stated, recorded = (scale or result.scale).frame_rate, result.provenance.get("frame_rate")
+    if stated is not None and (result.time_ns[result.finished] == UNKNOWN_TIME).any():
+        return stated, "as stated"
+    return recorded, "by the camera's file" if recorded else ""
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
@@ -120,19 +127,18 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     >>> frame_times(Result.open("my_result"), ScaleSettings(frame_rate=100.0))[:2].tolist()
     [0.0, 0.01]
     """
-    scale = result.section(ScaleSettings) if scale is None else scale
-    finished = result.finished
+    finished, stated = result.finished, (scale or result.scale).frame_rate
     stamps, numbers = result.time_ns[finished], result.number[finished]
     if (stamps == UNKNOWN_TIME).any():
         recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
-        rate = scale.frame_rate or recorded
+        rate, _ = frame_rate(result, scale)
         seconds = numbers / rate if rate else None
     else:
         seconds, choice = stamps * 1e-9, "the frames' own times %.6g: these are taken"
         recorded = np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)) if len(seconds) > 1 else None
     # stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %
-    if recorded and scale.frame_rate and abs(recorded / scale.frame_rate - 1) > 0.01:
-        logger.warning(f"scale.frame_rate states %g frames per second, {choice}", scale.frame_rate, recorded)
+    if recorded and stated and abs(recorded / stated - 1) > 0.01:
+        logger.warning(f"scale.frame_rate states %g frames per second, {choice}", stated, recorded)
     if seconds is None:
         return None
     times = np.full(len(result), np.nan)
@@ -350,16 +356,14 @@ class ResultInUnits(Portable):
 
     def displacement(self, frame: int) -> Displacement:
         """Read the displacement of all nodes in a frame, in rectified px."""
-        return self._rectify(next(self.result.table.iterate(DISPLACEMENT_QUANTITIES, [frame])))
+        record = self.result.table.read(frame, DISPLACEMENT_QUANTITIES)
+        return self._rectified(record, ("_std", "_bias_std"))[0]
 
-    def _rectify(self, record: Mapping[str, AnyArray], *suffixes: str) -> Displacement:
-        """Return the displacement of a record in rectified px, with uncertainties whose names have these suffixes."""
-        std = [record[f"{name}{suffix}"] for suffix in suffixes or ("_std", "_bias_std") for name in self.components]
-        displacement = Displacement.in_plane(record["u"], record["v"], *std)
-        if (bias := displacement.bias) is not None:  # NaN in records that were made without it
-            no_bias = np.isnan(bias) & np.isfinite(displacement.uncertainty)
-            displacement = replace(displacement, bias=np.where(no_bias, 0.0, bias))
-        return self.rectified.displacement(displacement)
+    def _rectified(self, record: Mapping[str, AnyArray], *suffixes: Sequence[str]) -> list[Displacement]:
+        """Return the displacement of a record in rectified px, with each group of uncertainties by their suffixes."""
+        groups = [[record[f"{name}{suffix}"] for suffix in group for name in UV] for group in suffixes]
+        in_px = [Displacement.in_plane(record["u"], record["v"], *std) for std in groups]
+        return [self.rectified.displacement(displacement) for displacement in in_px]
 
     def field(self, name: str, frame: int) -> Field:
         """Read one of the `quantities` with its standard uncertainty in a frame, in the reader's unit."""
@@ -383,7 +387,7 @@ class ResultInUnits(Portable):
         component, _, suffix = name.partition("_")
         if component not in self.components:
             return np.asarray(record[name])
-        rectified = self._rectify(record, f"_{suffix}").uncertainty
+        rectified = self._rectified(record, [f"_{suffix}"])[0].uncertainty
         return np.asarray(self.length * rectified[self.components.index(component)])
 
     def _discretisation_error(self, entry: ResultQuantity, record: Mapping[str, AnyArray]) -> FloatArray:
@@ -413,15 +417,15 @@ class ResultInUnits(Portable):
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""
-        record = next(self.result.table.iterate(None, [index]))
-        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std").std
-        gradient = self.mesh.element_gradient(displacement.values.T)
-        strain = self.gauges.strain(displacement, self.measure)
+        record, length = self.result.table.read(index), self.length
+        displacement, edge = self._rectified(record, ("_std", "_bias_std"), ["_edge_std"])
+        gradient = self.rectified.mesh.element_gradient(displacement.values.T)
         in_elements = unchecked_strain(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
+        strain = self.gauges.strain(displacement, self.measure)
         columns: dict[str, Any] = {name: np.asarray(record[name]) for name in self.columns if name in record}
         for field in (*map(self.units.convert, displacement.components), *strain.values()):
             columns |= {field.name: field.values, f"{field.name}_std": field.std}
             if field.bias is not None:
                 columns[f"{field.name}_bias_std"] = field.bias
-        columns |= zip(("u_edge_std", "v_edge_std"), self.length * np.asarray(edge), strict=True)
+        columns |= zip(("u_edge_std", "v_edge_std"), length * np.asarray(edge.std), strict=True)
         return columns | {f"{name}_element": in_elements[name].values for name in TENSOR}

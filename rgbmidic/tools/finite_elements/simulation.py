@@ -300,9 +300,7 @@ def find_placement(
             "each in mm and in px (`point_pairs`)"
         )
     placement = Placement.fit(points, rectification_of(result, scale, "mm").camera, label=source)
-    mm_per_pixel = (
-        scale or result.section(ScaleSettings)
-    ).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    mm_per_pixel = (scale or result.scale).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
     if (
         placement.mm_per_pixel is not None
         and mm_per_pixel is not None

@@ -14,10 +14,10 @@ import numpy as np
 from rgbmidic._version import __version__
 from rgbmidic.disk import check_file, write_text
 from rgbmidic.errors import InputError
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
+from rgbmidic.results import QUANTITIES, Maps, Result, speckle_diameter
 from rgbmidic.results.histories import read_histories
-from rgbmidic.results.result_in_units import ResultInUnits
-from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
+from rgbmidic.results.result_in_units import ResultInUnits, frame_rate
+from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings
 from rgbmidic.tools.report import curves, figures, style
 from rgbmidic.tools.report.gallery import REPORT
 from rgbmidic.tools.report.noise_floor import noise_floor
@@ -162,7 +162,7 @@ def write_report(
         else None,
         lines=_lines(maps.maps, probes, constants),
         frame_label=partial(_frame_label, physical),
-        rate=_frame_rate(physical),
+        rate=frame_rate(result, physical.scale),
         exposure=None if exposure is None else f"{exposure / 1000:g} µs",
         blur=1e-9 * (exposure or 0) * history.fastest if physical.units.timed else 0,
         speckle=None if speckle is None else physical.in_units(speckle),
@@ -173,17 +173,6 @@ def write_report(
         ),
     )
     write_text(out, text)
-
-
-def _frame_rate(physical: ResultInUnits) -> tuple[float | None, str]:
-    """Return the frame rate that `frame_times` follows, and its source; None if the frames have time stamps."""
-    result = physical.result
-    camera_rate = result.provenance.get("frame_rate"), "by the camera's file"
-    settings_rate = (physical.scale or result.section(ScaleSettings)).frame_rate, "as stated"
-    has_time_stamps = (result.time_ns[result.finished] != UNKNOWN_TIME).all()
-    return next(
-        (rate for rate in ([camera_rate] if has_time_stamps else [settings_rate, camera_rate]) if rate[0]), (None, "")
-    )
 
 
 def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Iterator[dict[str, Any]]:

@@ -330,7 +330,7 @@ class _Canvas:
         movie, canvas, times = self.movie, self._canvas, self._times
         canvas.restore_region(self._background)
         result = movie.maps.result
-        status, time = QUANTITIES["status"].codes[next(result.iterate("status", [frame]))], ""
+        status, time = QUANTITIES["status"].codes[result.table.read(frame, ["status"])["status"]], ""
         if times is not None:
             factor, unit, decimals = self._clock
             time = f"{factor * times[frame]:.{decimals}f} {unit}   "
