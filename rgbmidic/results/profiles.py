@@ -17,7 +17,6 @@ from rgbmidic.fields.history import rate_correlation
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.result_in_units import frame_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -107,7 +106,7 @@ class Profile:
         self.line = ProfileLine(
             physical.covariance, physical.gauges, *physical.rectified.probe_coordinates(endpoints, 2)
         )
-        times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
+        times, self.numbers = physical.seconds, physical.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
         self.data = Field(

@@ -176,12 +176,10 @@ class ResultInUnits(Portable):
         The result.
     scale
         What replaces its ``[scale]``; None: nothing.
-    units
-        Of lengths and times.
-    times : ndarray, shape (T,)
-        Of the frames: seconds where all are known and each is later than the one before, else places in the result.
     rectified
         Change to rectified px, where a camera is stated.
+    timed
+        Whether the times of all frames are read and known, and each is later than the one before.
     gauge
         Length of the virtual strain gauges in (rectified) px; None: the shortest there are.
     measure
@@ -190,9 +188,8 @@ class ResultInUnits(Portable):
 
     result: Result
     scale: ScaleSettings | None
-    units: Units
-    times: FloatArray
     rectified: Rectification
+    timed: bool = False
     gauge: float | None = None
     measure: str = MEASURES[0]
 
@@ -204,17 +201,40 @@ class ResultInUnits(Portable):
     @classmethod
     def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
-        rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
-        return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
+        return cls(result=result, scale=scale, rectified=rectification_of(result, scale))
 
     def with_times(self) -> Self:
         """Read the times of all frames."""
-        if (times := self.seconds) is None or not (np.diff(times) > 0).all():
-            return self
-        return replace(self, times=times, units=replace(self.units, timed=True))
+        timed = self.seconds is not None and bool((np.diff(self.seconds) > 0).all())
+        return self._changed("units", "columns", timed=timed)
+
+    def with_strain(self, gauge: float | None, measure: str) -> Self:
+        """Take the strain over another gauge, or of another measure."""
+        return self._changed("gauges", gauge=gauge, measure=measure)
+
+    def refreshed(self, result: Result) -> Self:
+        """Take the result with the frames that a run has added since."""
+        return self._changed("seconds", result=result)
+
+    def _changed(self, *outdated: str, **changes: Any) -> Self:
+        """Change fields, and keep what was derived, such as the covariance of the nodes, unless it is outdated."""
+        kept = self.__dict__.keys() - {*self.__dataclass_fields__, *outdated}
+        changed = replace(self, **changes)
+        changed.__dict__.update({name: self.__dict__[name] for name in kept})
+        return changed
+
+    @cached_property
+    def units(self) -> Units:
+        """Units of lengths and times."""
+        return replace(self.rectified.units, timed=self.timed)
+
+    @property
+    def times(self) -> FloatArray:
+        """Times (T,) of the frames: seconds where they are `timed`, else places in the result."""
+        seconds = self.seconds if self.timed else None
+        return np.arange(len(self.result), dtype=np.float64) if seconds is None else seconds
 
     components: ClassVar[tuple[str, ...]] = ("u", "v")
-    is_calibrated: ClassVar[bool] = False
 
     path, names, number, status, finished = (
         property(attrgetter(f"result.{name}")) for name in ("path", "names", "number", "status", "finished")
@@ -402,7 +422,7 @@ class ResultInUnits(Portable):
             return np.asarray(np.fmax.reduce(error / std))
         return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
 
-    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
+    def calibrated(self, field: Field, component: Callable[[str], Field], names: tuple[str, ...]) -> Field:
         """Add to the uncertainty of a vector's component or length what a calibration leaves; a scale's is in units."""
         return field
 

@@ -138,7 +138,7 @@ def write_report(
     if frames is None:
         sampled_frames = figures.select_evenly(figures.measured_frames(result), constants.map_frames)
         frames = sorted({*sampled_frames, history.farthest})
-    maps = figures.MapDrawer(Maps(result=result, physical=physical), style.PAGE_DPI)
+    maps = figures.MapDrawer(Maps(physical=physical), style.PAGE_DPI)
     exposure, speckle = provenance.get("exposure_ns"), speckle_size(result)
     statuses = result.status[list(result.deformed)]
     unconverged = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]

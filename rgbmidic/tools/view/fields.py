@@ -92,7 +92,7 @@ class FieldsInView:
     """
 
     def __init__(self, result: Result, view: ViewState) -> None:
-        self.result, self.view = result, view
+        self.view = view
         self.scale: ScaleSettings | None = None
         self.derivation: tuple[Any, ...] = ()
         self._raw = lru_cache(VIEWER.raw_frames)(RawPictures(result=result))
@@ -106,6 +106,11 @@ class FieldsInView:
         )
         self._ahead: tuple[tuple[Any, ...], ...] = ()
         self._test_range = lru_cache(8)(partial(range_over_test, maps))
+
+    @property
+    def result(self) -> Result:
+        """The result, with the frames that a run has added up to now."""
+        return self.maps.result
 
     @property
     def base(self) -> Path:
@@ -142,8 +147,7 @@ class FieldsInView:
 
     def grow(self, result: Result) -> None:
         """Go on with more frames of the result."""
-        self.result = result
-        self._use_maps(replace(self.maps, result=result))
+        self._use_maps(self.maps.refreshed(result))
 
     def values(self, name: str) -> Field:
         """Read a field in the frame in view."""
