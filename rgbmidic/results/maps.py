@@ -461,7 +461,9 @@ class Maps(Portable):
         """Times of the frames that are measured, or their numbers where no time is known."""
         times = self.physical.seconds
         if times is None and self._units.timed:
-            raise InputError("rates need the times of all frames, of which some have none: state frame_rate in [scale]")
+            raise InputError(
+                "rates need a time of each frame that is later than the one before: state frame_rate in [scale]"
+            )
         clock = self.result.number if times is None else times
         return np.asarray(clock[self._measured_frames], dtype=np.float64)
 

@@ -17,6 +17,7 @@ from rgbmidic.fields.history import rate_correlation
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.maps import Maps
+from rgbmidic.text import format_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -283,8 +284,9 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:
-        for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
-            cells = [frame, number, *([f"{clock:.12g}"] if time_columns else [])]
+        clock = format_times(profile.clock.tolist())
+        for row, (frame, number, time) in enumerate(zip(profile.frames, profile.numbers, clock, strict=True)):
+            cells = [frame, number, *([time] if time_columns else [])]
             for numbers in np.column_stack([positions, profile.values[row], profile.std[row]]).tolist():
                 yield [*cells, *numbers]
 

@@ -28,6 +28,7 @@ from rgbmidic.results.quantities import (
     DERIVED,
     ELEMENT_STRAIN,
     ERROR_QUANTITIES,
+    FAILED,
     MESH_DOCUMENT,
     QUANTITIES,
     STRAIN_COLUMNS,
@@ -93,13 +94,35 @@ def stored_camera(result: Result) -> CameraCalibration | None:
     return None if document is None else CameraCalibration.from_document(document, str(result.scale.camera))
 
 
+def _stamped_times(result: Result) -> FloatArray:
+    """Return the time of each measured frame (n,) in s by its time stamp; NaN where it has none.
+
+    That of a frame that could not be measured, such as one that could not be read, follows from its number.
+    """
+    stamps, number = result.time_ns[result.finished], result.number[result.finished].astype(np.float64)
+    stamped = stamps != UNKNOWN_TIME
+    seconds = np.where(stamped, stamps * 1e-9, np.nan)
+    if stamped.sum() > 1:
+        first, *_, last = number[stamped]
+        lost = ~stamped & (result.status[result.finished] == FAILED)
+        interval = np.median(np.diff(seconds[stamped]) / np.maximum(np.diff(number[stamped]), 1))
+        seconds[lost] = np.interp(number[lost], number[stamped], seconds[stamped])
+        seconds[lost] += interval * (number[lost] - np.clip(number[lost], first, last))
+    return seconds
+
+
+def _rises(seconds: FloatArray) -> bool:
+    """Report whether all times are known, and each is later than the one before."""
+    return bool(np.isfinite(seconds).all() and (np.diff(seconds) > 0).all())
+
+
 def frame_rate(result: Result, scale: ScaleSettings | None = None) -> tuple[float | None, str]:
     """Return the frame rate of a test and where it is from: that of ``[scale]`` before the camera's.
 
     Frames that have time stamps do not follow the ``[scale]``.
     """
     stated, recorded = (scale or result.scale).frame_rate, result.provenance.get("frame_rate")
-    if stated is not None and (result.time_ns[result.finished] == UNKNOWN_TIME).any():
+    if stated is not None and not _rises(_stamped_times(result)):
         return stated, "as stated"
     return recorded, "by the camera's file" if recorded else ""
 
@@ -107,8 +130,9 @@ def frame_rate(result: Result, scale: ScaleSettings | None = None) -> tuple[floa
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
     """Find the time of each frame.
 
-    Time stamps count where the files have one of every frame, from the trigger where the camera reports it; else the
-    time is the number of the frame over `frame_rate`, that of ``[scale]`` before the camera's.
+    Time stamps count where the files have one of every frame that could be measured, and each is later than the one
+    before, from the trigger where the camera reports it; else the time is the number of the frame over `frame_rate`,
+    that of ``[scale]`` before the camera's.
 
     Parameters
     ----------
@@ -128,14 +152,23 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     [0.0, 0.01]
     """
     finished, stated = result.finished, (scale or result.scale).frame_rate
-    stamps, numbers = result.time_ns[finished], result.number[finished]
-    if (stamps == UNKNOWN_TIME).any():
-        recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
-        rate, _ = frame_rate(result, scale)
-        seconds = numbers / rate if rate else None
+    stamps, number, names = _stamped_times(result), result.number[finished], np.array(result.names)[finished]
+    if _rises(stamps):
+        seconds: FloatArray | None = stamps
+        choice = "the frames' own times %.6g: these are taken"
+        recorded = np.median(np.maximum(np.diff(number), 1) / np.diff(stamps)) if len(stamps) > 1 else None
     else:
-        seconds, choice = stamps * 1e-9, "the frames' own times %.6g: these are taken"
-        recorded = np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)) if len(seconds) > 1 else None
+        rate, _ = frame_rate(result, scale)
+        recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
+        seconds = number / rate if rate else None
+        if not np.isnan(stamps).all():
+            row = int(np.argmax(np.isnan(stamps) | (np.diff(stamps, prepend=-np.inf) <= 0)))
+            problem = "has none" if np.isnan(stamps[row]) else "is not later than the one before"
+            text = "the time stamps of the frames are not used: %s %s (frame_rate in [scale] states the times)"
+            logger.warning(text, names[row], problem)
+        if seconds is not None and not _rises(seconds):
+            logger.warning("no time is known: the numbers of the frames do not rise")
+            seconds = None
     # stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %
     if recorded and stated and abs(recorded / stated - 1) > 0.01:
         logger.warning(f"scale.frame_rate states %g frames per second, {choice}", stated, recorded)
@@ -179,7 +212,7 @@ class ResultInUnits(Portable):
     rectified
         Change to rectified px, where a camera is stated.
     timed
-        Whether the times of all frames are read and known, and each is later than the one before.
+        Whether the times of the frames are read, and known.
     gauge
         Length of the virtual strain gauges in (rectified) px; None: the shortest there are.
     measure
@@ -205,8 +238,7 @@ class ResultInUnits(Portable):
 
     def with_times(self) -> Self:
         """Read the times of all frames."""
-        timed = self.seconds is not None and bool((np.diff(self.seconds) > 0).all())
-        return self._changed("units", "columns", timed=timed)
+        return self._changed("units", "columns", timed=self.seconds is not None)
 
     def with_strain(self, gauge: float | None, measure: str) -> Self:
         """Take the strain over another gauge, or of another measure."""
@@ -230,7 +262,7 @@ class ResultInUnits(Portable):
 
     @property
     def times(self) -> FloatArray:
-        """Times (T,) of the frames: seconds where they are `timed`, else places in the result."""
+        """Times (T,) of the frames: seconds where they are `timed`, NaN if not measured; else places in the result."""
         seconds = self.seconds if self.timed else None
         return np.arange(len(self.result), dtype=np.float64) if seconds is None else seconds
 

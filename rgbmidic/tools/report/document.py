@@ -157,9 +157,7 @@ def write_report(
         history=history,
         measured_fraction=history.fractions[:, 0],
         floor=noise_floor(physical),
-        histories=read_histories(result, probes, scale=physical.scale, channels=channels)
-        if probes.kind_coordinates
-        else None,
+        histories=read_histories(physical, probes, channels=channels) if probes.kind_coordinates else None,
         lines=_lines(maps.maps, probes, constants),
         frame_label=partial(_frame_label, physical),
         rate=frame_rate(result, physical.scale),
