@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
 from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import GainFit, inverse_gains
+from rgbmidic.correlation.brightness import GainFit, gain_and_offset, inverse_gains
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh

@@ -207,6 +207,23 @@ class NodalCovariance:
         fit, bias = (unit_rows(sp.hstack([matrix @ root for matrix in matrices])) for root in (self.fit, self.bias))
         return replace(self, fit=fit, bias=bias)
 
+    def moved(self, displacement: Displacement) -> Self:
+        """Return the covariance with the nodes at their deformed places; those without data stay.
+
+        Parameters
+        ----------
+        displacement
+            Of the N nodes, in the unit of their `points`, shape (c, N).
+
+        Returns
+        -------
+        NodalCovariance
+        """
+        deformed = self.points + np.nan_to_num(displacement.values.T)
+        if self.surface is not None:
+            return replace(self, surface=deformed)
+        return replace(self, mesh=Tri3Mesh(nodes=deformed, elements=self.mesh.elements))
+
     def subset(self, nodes: IntArray) -> Self:
         """Return the covariance of some nodes alone.
 
@@ -477,6 +494,25 @@ class RigidMotion:
             turned = replace(turned, covariance=covariance, std=np.sqrt(np.einsum("iin->in", covariance)))
         remaining = (arm + displacement.values.T - self.shift.values) @ self.back.T - arm
         return replace(turned, values=remaining.T)
+
+    def removed_gradient(self, gradient: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Turn displacement gradients back by the rotation; those in tangent planes of a surface in space do not turn.
+
+        Parameters
+        ----------
+        gradient : ndarray, shape (G, 2, 2)
+            ``H[c, d]``: derivative of the displacement c by the coordinate d.
+        covariance : ndarray, shape (G, 4, 4)
+            Of each gradient row by row.
+
+        Returns
+        -------
+        gradient, covariance : ndarray
+        """
+        if len(self.back) == 3:
+            return gradient, covariance
+        wide = np.kron(self.back, np.eye(2))
+        return self.back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
 
     @property
     def components(self) -> tuple[Field, ...]:

@@ -23,9 +23,9 @@ from rgbmidic.fields.history import Probe, of_probe
 from rgbmidic.fields.interpolation import MeshPoints, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
+from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.tangent_plane import in_tangent_plane
-from rgbmidic.fields.units import Units
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray

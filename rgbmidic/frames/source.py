@@ -11,11 +11,12 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import FrameError, convert_disk_errors, damaged_file, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, raw_frame
 from rgbmidic.renamed import state_new_names
-from rgbmidic.settings import FrameSettings, require_regular_file
+from rgbmidic.settings import FrameSettings
 
 _T = TypeVar("_T")
 _NOTHING_STATED = Recording()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import FrameError, damaged_file
 from rgbmidic.frames.data import Integers, Recording
 from rgbmidic.frames.hyperstacks import Hyperstack
@@ -32,7 +33,6 @@ from rgbmidic.frames.tiff_pages import (
     open_tiff,
     tag,
 )
-from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:

@@ -174,8 +174,8 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(positions)), scheduler)) as pool:
                 schedule.run(pool)
-        table = store.table().iterate(["status", "reason", "warnings"], positions)
-        texts = ((position, messages(record)) for position, record in zip(positions, table, strict=True))
+        table, names = store.table(), ("status", "reason", "warnings")
+        texts = ((position, messages(table.read(position, names))) for position in positions)
         for line in join_frame_warnings(texts, origin.names):
             logger.warning("%s", line)
         with collect_messages() as frame_messages:
@@ -227,8 +227,9 @@ class _ResultSink:
 
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
         """
-        names = ("u", "v", "node_status", "reference_updates", "best_match")
-        for values in self._store.table().iterate(names, range(position, -1, -1)):
+        names, table = ("u", "v", "node_status", "reference_updates", "best_match"), self._store.table()
+        for earlier in range(position, -1, -1):
+            values = table.read(earlier, names)
             if (values["node_status"] == NodeStatus.MEASURED).any():
                 return next_start(self._plan, values, TrackingState(displacement=None))
         return TrackingState(displacement=None)
@@ -239,8 +240,9 @@ class _ResultSink:
             return ()
         mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
         blank, updates = Solution.failed(mesh, lights, "", np.zeros(0)), []
-        names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
-        for position, values in zip(positions, self._store.table().iterate(names, positions), strict=True):
+        names, table = [*chain(*_OF_NODES.values()), "node_status", "rigid"], self._store.table()
+        for position in positions:
+            values = table.read(position, names)
             arrays: dict[str, Any] = {"node_status": values["node_status"], "rigid": values["rigid"].astype(np.float64)}
             for name, columns in _OF_NODES.items():
                 arrays[name] = np.stack([values[column] for column in columns], axis=1, dtype=np.float64)
@@ -270,9 +272,10 @@ def _invalidate_frames(plan: Plan, store: ResultStore, names: Sequence[str], *, 
     lost = np.flatnonzero(table.without_damaged(ended="finished" in read_provenance(store.path)).damaged).tolist()
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for position, is_finished in enumerate(table.finished.tolist()):
-        try:
-            values = next(table.iterate(["status", "unread", "tries"], [position] if is_finished else []))
-        except (ResultError, StopIteration):  # damaged, or not there: whatever it was
+        values = dict[str, Any]()
+        with suppress(ResultError):  # damaged, or not there: whatever it was
+            values = table.read(position, ["status", "unread", "tries"]) if is_finished else {}
+        if not values:
             changed.append(position)
             continue
         tries[position] = values["tries"]
@@ -293,7 +296,8 @@ def _invalidate_frames(plan: Plan, store: ResultStore, names: Sequence[str], *, 
 
 def _warn_duplicate_frames(plan: Plan, store: ResultStore, positions: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before or of the reference, bit for bit."""
-    sums = [values["checksum"] for values in store.table().iterate(["checksum"], positions)]
+    table = store.table()
+    sums = [table.read(position, ["checksum"])["checksum"] for position in positions]
     pairs = zip(positions[1:], sums[1:], sums, strict=False)
     repeated = [position for position, crc, before in pairs if crc == before != NO_CHECKSUM]
     selected, references = plan.series.selected, plan.settings.frames.reference

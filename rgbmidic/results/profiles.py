@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.history import rate_correlation
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.result_in_units import frame_times
+from rgbmidic.text import format_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -107,7 +107,7 @@ class Profile:
         self.line = ProfileLine(
             physical.covariance, physical.gauges, *physical.rectified.probe_coordinates(endpoints, 2)
         )
-        times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
+        times, self.numbers = physical.seconds, physical.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
         self.data = Field(
@@ -284,8 +284,9 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:
-        for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
-            cells = [frame, number, *([f"{clock:.12g}"] if time_columns else [])]
+        clock = format_times(profile.clock.tolist())
+        for row, (frame, number, time) in enumerate(zip(profile.frames, profile.numbers, clock, strict=True)):
+            cells = [frame, number, *([time] if time_columns else [])]
             for numbers in np.column_stack([positions, profile.values[row], profile.std[row]]).tolist():
                 yield [*cells, *numbers]
 

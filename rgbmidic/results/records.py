@@ -16,21 +16,20 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from rgbmidic.disk import npy_array, npy_bytes, require_regular_file, write_complete
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
-from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import BoolArray, IntArray
 
@@ -340,46 +339,43 @@ class FrameTable:
         damaged = ~self.finished & ended
         for frame in np.flatnonzero(self.finished).tolist():
             try:
-                next(self.iterate(None, [frame]))
+                self.read(frame)
             except AnotherTestError:
                 raise
             except ResultError:
                 damaged[frame] = True
         return replace(self, damaged=damaged)
 
-    def iterate(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
-        """Read some quantities of one frame after the other.
+    def read(self, frame: int, names: Iterable[str] = QUANTITIES) -> dict[str, Any]:
+        """Read some quantities of a frame, all unless stated; those of a frame that is not there are blank.
 
         Parameters
         ----------
+        frame
+            Its index.
         names
-            The quantities; None: all.
-        frames
-            Their indices, in any order.
+            The quantities.
 
-        Yields
-        ------
+        Returns
+        -------
         dict
-            The quantities of a frame by name.
+            The quantities by name.
 
         Raises
         ------
         ResultError
-            A record is damaged, or of another run; the message names file and frame.
+            The record is damaged, or of another run; the message names file and frame.
         """
-        selection, finished = tuple(QUANTITIES if names is None else names), self.finished
-        blank = cache(partial(FrameRecord.failed, nodes=self.sizes["node"], lights=self.sizes["light"]))
-        for frame in frames:
-            if not finished[frame]:
-                values = blank(_DAMAGED if self.damaged[frame] else _NOT_YET).values
-                yield {name: values[name] for name in selection}
-                continue
-            file = record_file(self.folder, frame)
-            try:
-                yield _read_record(file, frame, selection, self.run)
-            except OSError as error:
-                raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
-            except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
-                raise
-            except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
-                raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None
+        if self.write_times[frame] < 0 or self.damaged[frame]:
+            reason = _DAMAGED if self.damaged[frame] else _NOT_YET
+            blank = {name: QUANTITIES[name].unmeasured(self.sizes) for name in names} | {"reason": reason}
+            return {name: QUANTITIES[name].convert(blank[name], self.sizes) for name in names}
+        file = record_file(self.folder, frame)
+        try:
+            return _read_record(file, frame, names, self.run)
+        except OSError as error:
+            raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
+        except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
+            raise
+        except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
+            raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None

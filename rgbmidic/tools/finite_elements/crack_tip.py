@@ -26,7 +26,7 @@ from rgbmidic.fields.cracks import comma_separated, crack_faces, nearest_node
 from rgbmidic.fields.history import of_probe
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
-from rgbmidic.fields.units import Units
+from rgbmidic.fields.quantity import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete, write_errors
 from rgbmidic.errors import InputError
 from rgbmidic.fields import MEASURES
 from rgbmidic.frames import Window
@@ -26,7 +27,6 @@ from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.pipeline.user_objects import Series, open_frames
 from rgbmidic.results import Result, common_variance_fraction, frame_times
-from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice

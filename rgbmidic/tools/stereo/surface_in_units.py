@@ -56,7 +56,6 @@ class SurfaceInUnits(ResultInUnits):
     """
 
     result: LeftResult
-    is_calibrated: ClassVar[bool] = True
     components: ClassVar[tuple[str, ...]] = ("u", "v", "w")
 
     @classmethod
@@ -90,9 +89,7 @@ class SurfaceInUnits(ResultInUnits):
         mean_scale = float(np.sqrt(areas.sum() / mesh.areas.sum()))
         relative = float(result.stereo.attributes["relative_length_std"])
         units = Units(mm_per_pixel=mean_scale, mm_per_pixel_std=mean_scale * relative)
-        flat = Rectification(camera=None, image=mesh, mesh=mesh, units=units)
-        times = np.arange(len(result), dtype=np.float64)
-        return cls(result=result, scale=scale, units=units, times=times, rectified=flat)
+        return cls(result=result, scale=scale, rectified=Rectification(camera=None, image=mesh, mesh=mesh, units=units))
 
     @cached_property
     def points(self) -> FloatArray:
@@ -165,7 +162,7 @@ class SurfaceInUnits(ResultInUnits):
             return Field(name=name, unit=entry.unit, dims=("node",), values=arrays[0], std=std)
         if name in self.components:
             by_name = {one.name: one for one in self.displacement(frame).components}
-            return self.calibrated(by_name[name], by_name, (name,))
+            return self.calibrated(by_name[name], by_name.__getitem__, (name,))
         return super().field(name, frame)
 
     def frame(self, index: int) -> dict[str, AnyArray]:
@@ -182,15 +179,15 @@ class SurfaceInUnits(ResultInUnits):
         """The file of the result has all that is exported."""
         return self.result.stereo.export
 
-    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
+    def calibrated(self, field: Field, component: Callable[[str], Field], names: tuple[str, ...]) -> Field:
         """Add what the calibration leaves in a displacement or its rate, all places of which have it in common.
 
         Parameters
         ----------
         field
             Component, or length, of a vector.
-        vector
-            All components of the vector, by name, of the same shape.
+        component
+            Gives each component of the vector by its name, of the same shape.
         names
             Components that the field is the length of.
 
@@ -198,7 +195,7 @@ class SurfaceInUnits(ResultInUnits):
         -------
         Field
         """
-        values = np.stack([vector[name].values for name in self.components])
+        values = np.stack([component(name).values for name in self.components])
         weights = np.zeros_like(values)
         for row in map(self.components.index, names):
             weights[row] = 1.0 if len(names) == 1 else values[row] / np.maximum(field.values, np.finfo(float).tiny)
@@ -226,7 +223,7 @@ class SurfaceInUnits(ResultInUnits):
             vector = {name: by_name.get(f"{match[1]}{name}{match[3]}") for name in self.components}
             known = {name: field for name, field in vector.items() if field is not None}
             if len(known) == len(vector):
-                return self.calibrated(history, known, (match[2],))
+                return self.calibrated(history, known.__getitem__, (match[2],))
         if not history.unit.startswith("mm"):
             return history
         relative = float(self.result.stereo.attributes["relative_length_std"])
