@@ -259,8 +259,9 @@ class Maps(Portable):
         """Compute a displacement or a rate in the reader's units."""
         source, names, covariance = self._current, entry.base_quantities, None
         is_vector = {*names} <= {*source.components}
+        calibration = self._covariance.calibration if is_vector else None
         if entry.order:
-            needed = source.components if source.is_calibrated and is_vector else names
+            needed = names if calibration is None else source.components
             by_name = {name: self._rates(name, frame, entry.order) for name in needed}
         else:
             displacement = self.displacement(frame)
@@ -274,8 +275,13 @@ class Maps(Portable):
             matrix = error[:, :, None] ** 2 * np.eye(len(names))
             length, std = length_of(vector, matrix if covariance is None else np.moveaxis(covariance, 2, 0))
             field = replace(field, values=length, std=std, bias=None)
-        if is_vector:
-            field = source.calibrated(field, by_name, names)
+        if calibration is not None:  # of a length its slope by the components
+            vector = np.stack([by_name[name].values for name in source.components])
+            errors, rows = calibration.at_nodes(vector), [source.components.index(name) for name in names]
+            slope = vector[rows] / np.maximum(np.linalg.norm(vector[rows], axis=0), np.finfo(float).tiny)
+            field = field.with_common(
+                errors[:, rows[0]] if len(rows) == 1 else np.einsum("in,min->mn", slope, errors[:, rows])
+            )
         return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
 
     def displacement(self, frame: int) -> Displacement:
@@ -419,11 +425,8 @@ class Maps(Portable):
                 one.with_arrays(lambda array: np.where(in_both_frames, array, np.nan))
                 for one in (displacement, self._base_displacement)
             )
-            factor = self._shared_fraction(frame)
-            shared_covariance = factor * gauges.gradient(present.smaller(base))[1]
-            gradient, covariance = _relative_gradient(
-                gauges.gradient(present), gauges.gradient(base), shared_covariance
-            )
+            shared = gauges.shared_covariance(present, base, self._shared_fraction(frame))
+            gradient, covariance = _relative_gradient(gauges.gradient(present), gauges.gradient(base), shared)
         motion = self._rigid(self._relative_displacement(frame))
         if motion is not None and len(motion.back) == 2:  # in the tangent plane nothing turns
             wide = np.kron(motion.back, np.eye(2))

@@ -8,7 +8,7 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -208,7 +208,6 @@ class ResultInUnits(Portable):
         return replace(self, times=times, units=replace(self.units, timed=True))
 
     components: ClassVar[tuple[str, ...]] = ("u", "v")
-    is_calibrated: ClassVar[bool] = False
 
     path, names, number, status, finished = (
         property(attrgetter(f"result.{name}")) for name in ("path", "names", "number", "status", "finished")
@@ -397,14 +396,6 @@ class ResultInUnits(Portable):
         if len(error) > 1:
             return np.asarray(np.fmax.reduce(error / std))
         return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
-
-    def calibrated(self, field: Field, vector: Mapping[str, Field], names: tuple[str, ...]) -> Field:
-        """Add to the uncertainty of a vector's component or length what a calibration leaves; a scale's is in units."""
-        return field
-
-    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
-        """Add to the uncertainty of what probes measure what a calibration leaves; a scale's is in units."""
-        return histories
 
     @property
     def exporter(self) -> Callable[[str, BinaryIO], None] | None:

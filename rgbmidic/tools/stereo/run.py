@@ -196,7 +196,6 @@ def measure_stereo(
         "gauge_px": shape.gauges.gauges.length,
         "measure": settings.measure,
         "relative_length_std": shape.calibration.length_std,
-        "calibration_gain": shape.calibration.mean_gain(shape.triangulation.points),
         "common_variance_fraction": common_variance_fraction(first),
         "left": _path_from(out, first.path),
         "right": _path_from(out, second.path),

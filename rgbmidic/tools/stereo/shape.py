@@ -11,7 +11,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
-from rgbmidic.tools.stereo.calibration_part import CalibrationPart, covariance_of
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
 from rgbmidic.tools.stereo.surface import SurfaceGauges
@@ -124,8 +124,8 @@ class Shape:
             triangulation=shape,
             axes=axes_in_space,
             points=points,
-            covariance=axes_in_space.covariance(shape.covariance) + covariance_of(calibration.shape),
-            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
+            covariance=axes_in_space.covariance(shape.covariance) + _covariance_of(calibration.errors.surface),
+            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, calibration.errors, gauge, measure),
             calibration=calibration,
         )
 
@@ -156,14 +156,12 @@ class Shape:
         covariance = self.axes.covariance(deformed.covariance)
         gain = self.axes.rotation @ deformed.gain
         bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
-        errors = self.calibration.displacement(reference, deformed)
-        surface = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
-        strain, calibration_covariance = surface.strain, covariance_of(errors)
-        covariance = covariance + calibration_covariance
+        surface = self.gauges.strain(displacement, covariance)
+        strain = surface.strain
+        covariance = covariance + _covariance_of(self.calibration.errors.at_nodes(displacement.T))
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
-            "calibration_covariance": calibration_covariance,
             "epipolar_change": deformed.residual - reference.residual,
             "epipolar_change_std": deformed.residual_std,
             "normal": surface.normal,
@@ -221,6 +219,11 @@ def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(Non
     """Read what `Shape.frame` needs of some nodes of a frame."""
     values = next(result.table.iterate([*MATCHED, "number", "status"], [frame]))
     return {name: values[name][nodes] if name in MATCHED else values[name] for name in values}
+
+
+def _covariance_of(errors: FloatArray) -> FloatArray:
+    """Return the covariance (N, 3, 3) of independent errors (M, 3, N) of unit variance."""
+    return np.asarray(np.einsum("min,mjn->nij", errors, errors))
 
 
 def _weights(covariance: FloatArray) -> FloatArray:
