@@ -112,8 +112,12 @@ class Shape:
         """
         spread = _diagonal(np.zeros_like(carried_mesh.right_std), carried_mesh.right_std)
         pixels = carried_mesh.left.nodes, carried_mesh.right.nodes
-        shape = triangulate(pair, *pixels, spread, _weights(spread))
-        if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
+        shape, exchanged = (
+            triangulate(cameras, *pixels, spread, _weights(spread)) for cameras in (pair, pair.exchanged)
+        )
+        if not _is_plausible(shape) and _is_plausible(exchanged):
+            raise InputError(f"LEFT and RIGHT are exchanged: their references fit the cameras of {pair.name} so only")
+        if not _is_in_front(shape):
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
@@ -196,7 +200,7 @@ class Shape:
             yield (
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {common_std:.3f} px: "
                 f"the cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: "
-                "calibrate again (rgbmidic-calibrate stereo), unless LEFT and RIGHT are exchanged"
+                "calibrate again (rgbmidic-calibrate stereo)"
             )
         deviation = np.abs(shape.residual - np.median(shape.residual))
         scatter = np.maximum(1.4826 * np.median(deviation), shape.residual_std)
@@ -213,6 +217,16 @@ class Shape:
                 f"where {expected[worst]:.3f} px are stated: a camera moved or the frames of both cameras were not "
                 "taken at one time"
             )
+
+
+def _is_in_front(surface: Triangulation) -> bool:
+    return bool(np.isfinite(surface.points).all() and (surface.points[:, 2] > 0).all())
+
+
+def _is_plausible(surface: Triangulation) -> bool:
+    """Report whether the rays of a surface meet in front of the cameras but for what is not worth a warning."""
+    rms, std = (np.sqrt(np.mean(array**2)) for array in (surface.residual, surface.residual_std))
+    return _is_in_front(surface) and bool(rms <= max(LIMITS.residual, LIMITS.factor * std))
 
 
 def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:

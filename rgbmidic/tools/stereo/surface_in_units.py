@@ -81,6 +81,11 @@ class SurfaceInUnits(ResultInUnits):
                 f"lengths of {result.path} are those in space, mm; for px read the result of a camera, "
                 f"{result.left.path}"
             )
+        if scale is not None and (scale.mm_per_pixel is not None or scale.camera is not None):
+            raise InputError(
+                f"lengths of {result.path} are those in space: mm_per_pixel and camera of [scale] are of one camera, "
+                "leave them out"
+            )
         mesh, points = Tri3Mesh(nodes=result.nodes, elements=result.elements), _points(result)
         corners = points[mesh.elements]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

@@ -115,6 +115,8 @@ def test_a_left_result_is_taken_and_an_interrupted_one_gone_on_with(measured, pa
     again = measure_stereo(*tests, pair, tmp_path / "result", settings, resume=True, workers=1)
     there = [folder / "result" / side for side in ("left", "right")]
     taken = measure_stereo(*there, pair, tmp_path / "other", settings)
+    with pytest.raises(InputError, match="is of other cameras than"):
+        measure_stereo(*there, replace(pair, translation=2 * pair.translation), tmp_path / "other", resume=True)
     for other in (again, taken):
         for name in ("z", "w", "exx", "epipolar_change"):
             assert np.array_equal(other[name], result[name], equal_nan=True), name
@@ -136,6 +138,7 @@ CONTRADICTIONS = {
     "frames": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nlast = 1', "as many frames"),
     "references": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nreference = 1', "must name the same states"),
     "region": ("[0, 0, 159, 119]", "[0, 0, 20, 20]", "no element of the left mesh"),
+    "mesh": ("element_size = 16", "element_size = 24", r"state the same \[mesh\], or none"),
 }
 
 
@@ -184,6 +187,24 @@ def test_frame_rates_and_times_that_differ_are_refused(measured, pair, tmp_path,
     tests = [folder / side / "TEST.toml" for side in ("left", "right")]
     with pytest.raises(InputError, match=r"frames 0 of .* were taken 0.008 s apart"):
         measure_stereo(*tests, pair, tmp_path / "result")
+
+
+def test_frames_that_one_camera_lost_are_refused(measured, pair, tmp_path):
+    folder, _ = measured
+    shutil.copytree(folder / "right", tmp_path / "right")
+    (tmp_path / "right/frame_2.tif").rename(tmp_path / "right/frame_7.tif")
+    with pytest.raises(InputError, match=r"frames 2 of .* have the numbers 2 and 7, counted from the first"):
+        measure_stereo(folder / "left/TEST.toml", tmp_path / "right/TEST.toml", pair, tmp_path / "result")
+
+
+def test_exchanged_cameras_are_refused(measured, pair, tmp_path):
+    """The references fit in the other order only: of the left result as the right one there is nothing to measure."""
+    folder, _ = measured
+    there = [folder / "result" / side for side in ("left", "right")]
+    with pytest.raises(InputError, match="LEFT and RIGHT are exchanged"):
+        measure_stereo(*there, pair.exchanged, tmp_path / "result")
+    assert not (tmp_path / "result").exists()
+    assert pair.exchanged.exchanged.parameters == pytest.approx(pair.parameters)
 
 
 def test_another_size_is_refused(measured, pair, tmp_path):

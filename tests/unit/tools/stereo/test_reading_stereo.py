@@ -121,6 +121,8 @@ def test_what_a_surface_has_not_is_said_in_one_line(surface, measured, pair, tmp
         read_histories(surface, ProbeSettings(cracks=(ENDS,)))
     with pytest.raises(InputError, match="for px read the result of a camera"):
         Maps.from_result(surface, ScaleSettings(unit="px"))
+    with pytest.raises(InputError, match="are those in space: mm_per_pixel and camera of"):
+        Maps.from_result(surface, ScaleSettings(mm_per_pixel=0.2))
     with pytest.raises(InputError, match="has the displacements u, v, w"):
         Comparison(surface, None, None)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="is a result of two cameras; the result of one is"):
