@@ -40,6 +40,8 @@ class Field:
         Standard uncertainty; None for what has none, NaN where it is not known.
     bias : ndarray of the same shape, or None
         The part of `std` that nodes near each other have in common, which the bias of the lights leaves; None: nothing.
+    common : ndarray, shape (M, ...), or None
+        Errors, part of `std`, that M independent causes of a calibration make in all places and frames together.
     note
         What a reader should know of it, else empty.
 
@@ -56,6 +58,7 @@ class Field:
     unit: str = ""
     dims: tuple[str, ...] = ("frame",)
     bias: FloatArray | None = None
+    common: FloatArray | None = None
     note: str = ""
 
     @property
@@ -72,6 +75,28 @@ class Field:
     def bias_std(self) -> FloatArray:
         """The `bias` as an array: 0 where there is none."""
         return np.zeros_like(self.values) if self.bias is None else self.bias
+
+    @property
+    def noise(self) -> Self:
+        """The field without the `common` errors in its uncertainty."""
+        if self.common is None:
+            return self
+        variance = self.uncertainty**2 - (self.common**2).sum(axis=0)
+        return replace(self, std=np.sqrt(np.maximum(variance, 0)), common=None)
+
+    def with_common(self, errors: FloatArray) -> Self:
+        """Return the field with errors that all places and frames have in common, as part of its uncertainty.
+
+        Parameters
+        ----------
+        errors : ndarray, shape (M, ...)
+            See `common`; the field has none so far.
+
+        Returns
+        -------
+        Field
+        """
+        return replace(self, std=np.hypot(self.uncertainty, np.linalg.norm(errors, axis=0)), common=errors)
 
     def with_arrays(self, function: Callable[..., Any], *others: Self) -> Self:
         """Return the field with a function of each of its arrays, and of the same array of other fields.
@@ -324,9 +349,6 @@ class FieldSource(Protocol):
     @property
     def components(self) -> tuple[str, ...]:
         """Names of the components of the displacement."""
-
-    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
-        """Add to the uncertainty of what probes measure what a calibration leaves, where `units` does not."""
 
     @property
     def covariance(self) -> NodalCovariance:

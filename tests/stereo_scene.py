@@ -20,6 +20,8 @@ DISTANCE = 400.0
 FOCAL = 2000.0
 PITCH = DISTANCE / FOCAL
 """mm per px."""
+EDGE = 1.0
+"""Where the plate's step lies in its own x (mm), between the nodes of elements of 20 px."""
 
 
 def turn(*degrees: float):
@@ -36,11 +38,15 @@ def pair_of(angle: float = 20.0, lens=(FOCAL, 79.5, 59.5, 0, 0, 0, 0, 0), **chan
 
 @dataclass(frozen=True)
 class Motion:
-    """The plate at a place: `stretch` (2, 2) of its material, then rotation and translation (mm)."""
+    """The plate at a place: `stretch` (2, 2) of its material, then rotation and translation (mm).
+
+    Beyond `EDGE` it lies `step` mm deeper.
+    """
 
     stretch: tuple = ((1.0, 0.0), (0.0, 1.0))
     degrees: tuple = (0.0, 0.0, 0.0)
     translation: tuple = (0.0, 0.0, 0.0)
+    step: float = 0.0
 
     @property
     def attitude(self):
@@ -48,17 +54,21 @@ class Motion:
 
     def points(self, material):
         """Points (N, 3) of material ones (N, 2), left camera's axes."""
-        flat = np.c_[material @ np.array(self.stretch).T, np.zeros(len(material))]
+        flat = np.c_[material @ np.array(self.stretch).T, np.where(material[:, 0] > EDGE, self.step, 0.0)]
         return flat @ self.attitude.T + self.translation + np.array([0, 0, DISTANCE])
 
     def material(self, pair: CameraPair, side: int, pixels):
         """Material points (N, 2) that a camera sees at pixels."""
         lens, (rotation, shift) = pair.cameras[side].lens, pair.poses[side]
         rays = np.c_[(undistorted(lens, pixels) - lens[1:3]) / lens[0], np.ones(len(pixels))] @ rotation
-        centre = -rotation.T @ shift - self.translation - np.array([0, 0, DISTANCE])
-        normal = self.attitude[:, 2]
-        places = (centre - rays * ((normal @ centre) / (rays @ normal))[:, None]) @ self.attitude
-        return places[:, :2] @ np.linalg.inv(self.stretch).T
+        centre = (-rotation.T @ shift - self.translation - np.array([0, 0, DISTANCE])) @ self.attitude
+        rays = rays @ self.attitude
+        front, rear = (
+            (centre + rays * ((depth - centre[2]) / rays[:, 2])[:, None])[:, :2] @ np.linalg.inv(self.stretch).T
+            for depth in (0.0, self.step)
+        )
+        rear[:, 0] = np.maximum(rear[:, 0], EDGE)  # the wall of the step
+        return np.where(front[:, :1] <= EDGE, front, rear)
 
 
 def image(pair: CameraPair, side: int, motion: Motion = Motion(), seed: int = 0, shape=SHAPE):

@@ -182,6 +182,11 @@ def estimate_stereo(pairs: Sequence[ViewPair], rejected: Sequence[str] = ()) -> 
             f"the points are off by {max(fit.rms):.2f} px rms once both cameras are fitted together, at most "
             f"{CAMERA_LIMITS.max_residual:g} is what cameras at rest leave: were all views taken at one time by both?"
         )
+    if not fit.pair.baseline > 5 * np.sqrt(np.trace(fit.pair.covariance[19:, 19:])):
+        raise CalibrationError(
+            f"both cameras stand at one place: their distance is {fit.pair.baseline:.2g} mm, which is nothing within "
+            "its uncertainty: are the photographs of one camera stated twice?"
+        )
     held_out = list(pairs[LIMITS.held_out - 1 :: LIMITS.held_out])
     if held_out and len(pairs) - len(held_out) >= LIMITS.min_fitted:
         fitted = [number for number in range(len(pairs)) if (number + 1) % LIMITS.held_out]
@@ -343,7 +348,9 @@ class _Fit:
         count = 4 * sum(map(len, residuals))
         covariance = np.zeros((22, 22))
         variance = squares / (count - len(active) - 6 * len(views))
-        covariance[np.ix_(active, active)] = np.linalg.inv(normal) * variance
+        scale = 1 / np.sqrt(np.diag(normal))  # px, rad and mm: the inverse is symmetric to rounding then only
+        inverse = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+        covariance[np.ix_(active, active)] = (inverse + inverse.T) / 2 * variance
         everything = np.concatenate(residuals)
         rms = tuple(float(np.sqrt((everything[:, columns] ** 2).mean())) for columns in (slice(2), slice(2, 4)))
         lenses = [np.pad(covariance[block, block], (0, 8)) for block in (slice(8), slice(8, 16))]

@@ -4,7 +4,14 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, Probe, high_pass, rates
 from rgbmidic.fields.interpolation import MeshPoints, at_nodes, at_pixels, field_rms
-from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, difference_std, frame_covariance, reference_fraction
+from rgbmidic.fields.nodal import (
+    CalibrationErrors,
+    NodalCovariance,
+    RigidMotion,
+    difference_std,
+    frame_covariance,
+    reference_fraction,
+)
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
@@ -17,6 +24,7 @@ __all__ = [
     "MEASURES",
     "SIGMA",
     "Area",
+    "CalibrationErrors",
     "CameraCalibration",
     "Displacement",
     "Field",

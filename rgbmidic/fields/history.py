@@ -168,7 +168,7 @@ def rates(
     (np.float64(50.0), np.float64(0.0))
     """
     frame_times, quantity, error = (
-        np.asarray(array, dtype=np.float64) for array in (times, field.values, field.uncertainty)
+        np.asarray(array, dtype=np.float64) for array in (times, field.values, field.noise.uncertainty)
     )
     references = np.asarray(references, dtype=bool)
     if not (frame_times.ndim == references.ndim == 1 and quantity.ndim and frame_times.size):
@@ -203,10 +203,24 @@ def rates(
         )
     out[:, :, 3:] = np.where(kink[:, None, None], out[:, :, 3:], np.nan)
     by_quantity = out.transpose(1, 2, 3, 0).reshape(2, len(_POWERS), *quantity.shape)
-    return {
-        name: replace(field, name=name, values=by_quantity[0, i], std=by_quantity[1, i], bias=None)
+    fields = {
+        name: replace(field.noise, name=name, values=by_quantity[0, i], std=by_quantity[1, i], bias=None)
         for i, name in enumerate(_POWERS)
     }
+    if field.common is None:
+        return fields
+    return {
+        name: one.with_common(_derivative(frame_times, field.common, _POWERS[name])) for name, one in fields.items()
+    }
+
+
+def _derivative(times: FloatArray, errors: FloatArray, power: int) -> FloatArray:
+    """Differentiate errors (M, T) that all frames have in common: in proportion to the motion, they have no noise."""
+    has_data = np.isfinite(errors).all(axis=0)
+    measured_times, derivative = times[has_data], errors[:, has_data]
+    for _ in range(power if len(measured_times) > 1 else 0):
+        derivative = np.gradient(derivative, measured_times, axis=1)
+    return np.array([np.interp(times, measured_times, row) for row in derivative]).reshape(errors.shape)
 
 
 def _noise(

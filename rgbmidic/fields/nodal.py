@@ -38,6 +38,50 @@ _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CalibrationErrors:
+    """Errors that M independent causes of unit variance of a calibration make at n nodes, at all of them together.
+
+    Attributes
+    ----------
+    surface : ndarray, shape (M, c, n)
+        Of the places of the nodes.
+    gain : ndarray, shape (M, c, c, n)
+        Of each component of a displacement, over each component of it: nothing of what does not move.
+    """
+
+    surface: FloatArray
+    gain: FloatArray
+
+    def at_nodes(self, values: FloatArray) -> FloatArray:
+        """Return the errors (M, c, n) of displacements (c, n) of the nodes; NaN where these are."""
+        return np.asarray(np.einsum("mijn,jn->min", self.gain, values))
+
+    def subset(self, nodes: IntArray) -> Self:
+        """Return the errors of some nodes (m,) alone."""
+        return replace(self, surface=self.surface[..., nodes], gain=self.gain[..., nodes])
+
+    def of_sums(self, weights: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the errors of weighted sums of the nodes' places and of their displacements.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (..., S, n)
+            Of the nodes.
+        values : ndarray, shape (c, ..., n)
+            Displacements; NaN only where the weight is 0.
+
+        Returns
+        -------
+        surface, displacement : ndarray, shape (M, ..., c, S)
+        """
+        weighted = weights * np.nan_to_num(values)[..., None, :]
+        return (
+            np.einsum("...sn,min->m...is", weights, self.surface, optimize=True),
+            np.einsum("j...sn,mijn->m...is", weighted, self.gain, optimize=True),
+        )
+
+
 @state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodalCovariance:
@@ -60,6 +104,8 @@ class NodalCovariance:
         Places of the n nodes in space, in the unit of a displacement in space; None: it is in the mesh's plane.
     surface_covariance : ndarray, shape (3, 3, n), or None
         Covariance of each of these places; None: not known.
+    calibration
+        Errors of the calibration; None: there are none, or a scale has them.
 
     Examples
     --------
@@ -75,6 +121,7 @@ class NodalCovariance:
     bias: sp.csr_matrix
     surface: FloatArray | None = None
     surface_covariance: FloatArray | None = None
+    calibration: CalibrationErrors | None = None
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
@@ -242,6 +289,8 @@ class NodalCovariance:
             part = replace(part, surface=self.surface[nodes])
         if self.surface_covariance is not None:
             part = replace(part, surface_covariance=self.surface_covariance[..., nodes])
+        if self.calibration is not None:
+            part = replace(part, calibration=self.calibration.subset(nodes))
         return part
 
 
@@ -457,18 +506,20 @@ class RigidMotion:
         flat = by_sums.reshape(count + len(axes), -1)
         std = np.sqrt(np.einsum("ka,ab,kb->k", flat, covariance.of_sums(weights, displacement), flat))
         rotation = Rotation.from_matrix(back.T).as_rotvec() if count == 3 else np.arctan2(back[0, 1], back[0, 0])
-        return cls(
-            centre=centre,
-            shift=Field(name="rigid", unit=unit, dims=("component",), values=shift, std=std[:count]),
-            rotation=Field(
-                name="rigid_rotation",
-                unit="rad",
-                dims=("component",)[: np.ndim(rotation)],
-                values=np.asarray(rotation),
-                std=std[count:].reshape(np.shape(rotation)),
-            ),
-            back=back,
+        shift_field = Field(name="rigid", unit=unit, dims=("component",), values=shift, std=std[:count])
+        rotation_field = Field(
+            name="rigid_rotation",
+            unit="rad",
+            dims=("component",)[: np.ndim(rotation)],
+            values=np.asarray(rotation),
+            std=std[count:].reshape(np.shape(rotation)),
         )
+        if covariance.calibration is not None:
+            of_places, of_motion = covariance.calibration.of_sums(weights, displacement.values)
+            shift_field = shift_field.with_common(of_motion[:, :, 0])
+            turning = of_motion - (back.T - np.eye(count)) @ of_places
+            rotation_field = rotation_field.with_common(np.einsum("kij,mij->mk", by_sums[count:], turning))
+        return cls(centre=centre, shift=shift_field, rotation=rotation_field, back=back)
 
     def removed(self, nodes: FloatArray, displacement: Displacement) -> Displacement:
         """Subtract the rigid motion from a displacement field: the field in axes that move with the body.

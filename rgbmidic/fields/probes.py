@@ -25,7 +25,7 @@ from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
-from rgbmidic.fields.tangent_plane import in_tangent_plane
+from rgbmidic.fields.tangent_plane import gradient_errors, in_tangent_plane
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
@@ -153,7 +153,11 @@ class Mean:
         self, displacement: Displacement, weights: FloatArray, measured: FloatArray
     ) -> list[Field]:
         note = _coverage_note(self.name, "mean", self.sum.inside * measured)
-        return of_probe(self.name, [self.average(weights, one) for one in displacement.components], note)
+        means = [self.average(weights, one) for one in displacement.components]
+        if (calibration := self.covariance.calibration) is not None:
+            errors = calibration.of_sums(weights[:, None], displacement.values)[1][..., 0]
+            means = [mean.with_common(errors[..., row]) for row, mean in enumerate(means)]
+        return of_probe(self.name, means, note)
 
     def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, FloatArray]:
         """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
@@ -284,23 +288,33 @@ class Gauge:
 
     def histories(self, displacement: Displacement) -> list[Field]:
         """Compute the extension and the strain from the displacements of its `nodes` in every frame."""
-        weights, length = self._relative.weights(displacement.is_measured)[0], float(np.linalg.norm(self.arm))
+        weights, nodal = self._relative.weights(displacement.is_measured)[0], self._relative.covariance
         relative = np.stack([_products(weights[:, 0], values).sum(axis=1) for values in displacement.values], axis=1)
-        covariance = self._relative.covariance.of_sums(weights, displacement)
-        deformed_arm = self.arm + relative if self.moving else np.broadcast_to(self.arm, relative.shape)
-        deformed_length = np.linalg.norm(deformed_arm, axis=1)
-        towards = deformed_arm / deformed_length[:, None]
-        values = deformed_length - length if self.moving else (towards * relative).sum(axis=1)
+        covariance, length = nodal.of_sums(weights, displacement), float(np.linalg.norm(self.arm))
+        values, towards = self._lengths(self.arm, relative)
         std = np.sqrt(np.einsum("ta,tab,tb->t", towards, covariance, towards))
-        extension = Field(name="extension", unit=displacement.unit, values=values, std=std)
-        strain = replace(extension.with_arrays(lambda array: array / length), name="strain", unit="")
-        nodal = self._relative.covariance
-        if nodal.surface is None or nodal.surface_covariance is None or not self.moving:
-            return of_probe(self.name, [extension, strain])
-        surface = Displacement(values=nodal.surface.T, covariance=nodal.surface_covariance)
-        shape = np.einsum("ta,tab,tb->t", towards, nodal.of_sums(weights, surface), towards)
-        deformed = replace(extension, name="length", values=deformed_length, std=np.sqrt(std**2 + shape))
-        return of_probe(self.name, [extension, strain, deformed])
+        stds, names = [std, std / length], ("extension", "strain", "length")
+        if nodal.surface is not None and nodal.surface_covariance is not None and self.moving:
+            surface = Displacement(values=nodal.surface.T, covariance=nodal.surface_covariance)
+            shape = np.einsum("ta,tab,tb->t", towards, nodal.of_sums(weights, surface), towards)
+            stds.append(np.sqrt(std**2 + shape))
+        units = displacement.unit, "", displacement.unit
+        fields = [
+            Field(name=n, unit=u, values=v, std=s) for n, u, v, s in zip(names, units, values, stds, strict=False)
+        ]
+        if nodal.calibration is not None:
+            of_arm, of_relative = (one[..., 0] for one in nodal.calibration.of_sums(weights, displacement.values))
+            changed = self._lengths(self.arm + of_arm, relative + of_relative)[0] - values[:, None]
+            fields = [field.with_common(errors) for field, errors in zip(fields, changed, strict=False)]
+        return of_probe(self.name, fields)
+
+    def _lengths(self, arm: FloatArray, relative: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return extension, strain and length (3, ...) of arms (..., c) and the direction of the deformed ones."""
+        deformed = arm + relative if self.moving else np.broadcast_to(arm, relative.shape)
+        length, deformed_length = (np.linalg.norm(one, axis=-1) for one in (arm, deformed))
+        towards = deformed / deformed_length[..., None]
+        extension = deformed_length - length if self.moving else (towards * relative).sum(axis=-1)
+        return np.stack([extension, extension / length, deformed_length]), towards
 
 
 class StrainGauge:
@@ -354,10 +368,19 @@ def _strain(slopes: FloatArray, displacement: Displacement, covariance: NodalCov
     """Compute the strain (T,) of the displacement gradient that weights (T, 2, m) of the nodes give."""
     gradient = np.stack([_products(slopes, values[:, None]).sum(axis=2) for values in displacement.values], axis=1)
     spread = covariance.of_sums(slopes, displacement)
-    if covariance.surface is not None:
-        tangents = np.stack([_products(slopes, nodes).sum(axis=2) for nodes in covariance.surface.T], axis=1)
-        gradient, spread = in_tangent_plane(tangents, gradient, spread)
-    return strain_of_gradient(gradient, spread, measure)
+    if covariance.surface is None:
+        return strain_of_gradient(gradient, spread, measure)
+    tangents = np.stack([_products(slopes, nodes).sum(axis=2) for nodes in covariance.surface.T], axis=1)
+    in_plane, spread = in_tangent_plane(tangents, gradient, spread)
+    strain = strain_of_gradient(in_plane, spread, measure)
+    if covariance.calibration is not None:
+        of_sums = covariance.calibration.of_sums(slopes, displacement.values)
+        errors = gradient_errors(tangents, gradient, *of_sums).reshape(-1, *in_plane.shape)
+        changed = strain_of_gradient(in_plane + errors, np.zeros((*errors.shape[:2], 4, 4)), measure)
+        for name, field in strain.items():
+            change = changed[name].values - field.values
+            strain[name] = field.with_common((change + 90) % 180 - 90 if name == "direction" else change)
+    return strain
 
 
 class Area(Mean):

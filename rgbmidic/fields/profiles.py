@@ -202,14 +202,17 @@ class ProfileLine:
         Field
             Of the shape (P,); NaN where a node around is not measured.
         """
-        near = field.isel(node=self.nodes)
+        near = field.noise.isel(node=self.nodes)
         weights = self._weights(np.isfinite(near.values).tobytes())
         values = weights @ np.nan_to_num(near.values)
         variance = self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, near.bias_std)
         std = np.where(np.isfinite(values), np.sqrt(variance), np.nan)
-        return replace(field, dims=("position",), values=values, std=std, bias=None)
+        along = replace(near, dims=("position",), values=values, std=std, bias=None)
+        if field.common is None:
+            return along
+        return along.with_common(np.nan_to_num(field.common[:, self.nodes]) @ weights.T)
 
-    def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
+    def correlation(self, kind: str = "", bias_fraction: float = 0.0, common_fraction: float = 0.0) -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.
 
         Parameters
@@ -217,7 +220,9 @@ class ProfileLine:
         kind
             Key of `covariances`.
         bias_fraction
-            Part of the variance that the lights' bias leaves.
+            Part of the noise's variance that the lights' bias leaves.
+        common_fraction
+            Part of the variance that all points have in common, which a calibration leaves.
 
         Returns
         -------
@@ -225,7 +230,7 @@ class ProfileLine:
         """
         weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool).tobytes()))
         errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
-        return _unit(errors @ errors.T)
+        return (1 - common_fraction) * _unit(errors @ errors.T) + common_fraction
 
 
 def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:

@@ -28,7 +28,7 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.quantity import ResultQuantity
-from rgbmidic.fields.tangent_plane import in_tangent_plane
+from rgbmidic.fields.tangent_plane import gradient_errors, in_tangent_plane
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings.schema import STRAIN_MEASURES
@@ -444,7 +444,8 @@ class StrainGauges:
         np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _MARGIN / 2 * mesh.sizes[node])
         lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
-        self.starts, self.bias, self.surface = pattern.indptr, covariance.bias, covariance.surface
+        self.starts, self.bias = pattern.indptr, covariance.bias
+        self.surface, self.calibration = covariance.surface, covariance.calibration
         self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
         self.nodes = pattern.indices.astype(np.int64)
         distance = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
@@ -517,6 +518,7 @@ class StrainGauges:
         gauges = copy(self)
         gauges.points, gauges.needed, gauges.bias = self.points[nodes], self.needed[:, nodes], self.bias[nodes]
         gauges.surface = None if self.surface is None else self.surface[nodes]
+        gauges.calibration = None if self.calibration is None else self.calibration.subset(nodes)
         gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [matrix[:, nodes] for matrix in self.slopes]
         return gauges
 
@@ -536,10 +538,61 @@ class StrainGauges:
         covariance : ndarray, shape (G, 4, 4)
             Of the gradient row by row.
         """
+        gradient, covariance = self._gradient(displacement)
+        return gradient, covariance + self._calibration_covariance(displacement, displacement)
+
+    def shared_covariance(self, first: Displacement, second: Displacement, fraction: float) -> FloatArray:
+        """Return the covariance (G, 4, 4) between the gradients of two frames.
+
+        Parameters
+        ----------
+        first, second
+            Of the frames, with data at the same nodes.
+        fraction
+            Part of the smaller one of the variances of their noise that both have in common.
+
+        Returns
+        -------
+        ndarray, shape (G, 4, 4)
+        """
+        noise = self._gradient(first.smaller(second))[1]
+        return np.asarray(fraction * noise + self._calibration_covariance(first, second))
+
+    def _gradient(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
+        """Return the `gradient` with the covariance that the nodes' noise leaves."""
         slopes, covariance = self.slopes_of(displacement)
         if self.surface is None:
             return slopes, covariance
         return in_tangent_plane(self.tangents(displacement.is_measured), slopes, covariance)
+
+    def _calibration_covariance(self, first: Displacement, second: Displacement) -> FloatArray:
+        """Return what the calibration adds to the covariance between the gradients of two frames."""
+        if self.calibration is None:
+            return np.zeros(1)
+        errors = [
+            gradient_errors(self.tangents(one.is_measured), self.slopes_of(one)[0], *self.slope_errors(one))
+            for one in (first, second)
+        ]
+        return np.asarray(np.einsum("mga,mgb->gab", *errors))
+
+    def slope_errors(self, displacement: Displacement) -> tuple[FloatArray, FloatArray]:
+        """Fit the planes to the errors that the calibration makes in one frame.
+
+        Parameters
+        ----------
+        displacement
+            As of `gradient`, in space.
+
+        Returns
+        -------
+        surface, displacement : ndarray, shape (M, G, 3, 2)
+            Of the `tangents` and of the slopes of the displacement; empty without a calibration.
+        """
+        measured, nodal = displacement.is_measured, np.zeros((2, 0, *displacement.values.shape))
+        if self.calibration is not None:
+            nodal = np.stack([self.calibration.surface, self.calibration.at_nodes(displacement.values)])
+        surface, moved = (self.fit(np.moveaxis(one, -1, 0), measured).swapaxes(0, 1) for one in nodal)
+        return surface, moved
 
     def tangents(self, measured: BoolArray) -> FloatArray:
         """Fit the planes to the nodes in space, as to the displacements of those of them that have data.

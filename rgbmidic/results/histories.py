@@ -234,7 +234,6 @@ def read_histories(
     quantities = tuple(
         quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
     )
-    quantities = tuple(source.with_calibration(quantities))
     remarks = [*source.remarks, *_remarks(source, base, steps, by_probe)]
     if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
@@ -278,7 +277,11 @@ def _read_probes(
     for component in zip(*(motion.components for motion in motions.values()), strict=True):
         values, std = np.full((2, len(frames)), np.nan)
         values[[*motions]], std[[*motions]] = zip(*((one.values, one.uncertainty) for one in component), strict=True)
-        histories.append(replace(component[0], dims=("frame",), values=values, std=std))
+        history, common = replace(component[0], dims=("frame",), values=values, std=std), component[0].common
+        if common is not None:
+            common = np.full((len(common), len(frames)), np.nan)
+            common[:, [*motions]] = np.stack([one.common for one in component], axis=1)
+        histories.append(replace(history, common=common))
     return [Displacement.concatenate(fields) for fields in of_probes], histories, steps
 
 

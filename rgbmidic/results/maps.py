@@ -267,7 +267,8 @@ class Maps(Portable):
 
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
         """Compute a displacement or a rate in the reader's units."""
-        names, covariance = entry.base_quantities, None
+        source, names, covariance = self.physical, entry.base_quantities, None
+        calibration = self._covariance.calibration if {*names} <= {*source.components} else None
         if entry.order:
             component: Callable[[str], Field] = partial(self._rates, frame=frame, order=entry.order)
         else:
@@ -284,8 +285,13 @@ class Maps(Portable):
             matrix = error[:, :, None] ** 2 * np.eye(len(names))
             length, std = length_of(vector, matrix if covariance is None else np.moveaxis(covariance, 2, 0))
             field = replace(field, values=length, std=std, bias=None)
-        if {*names} <= {*self.physical.components}:
-            field = self.physical.calibrated(field, component, names)
+        if calibration is not None:  # of a length its slope by the components
+            vector = np.stack([component(name).values for name in source.components])
+            errors, rows = calibration.at_nodes(vector), [source.components.index(name) for name in names]
+            slope = vector[rows] / np.maximum(np.linalg.norm(vector[rows], axis=0), np.finfo(float).tiny)
+            field = field.with_common(
+                errors[:, rows[0]] if len(rows) == 1 else np.einsum("in,min->mn", slope, errors[:, rows])
+            )
         return replace(self._units.convert(field), name=entry.name, unit=entry.unit)
 
     def displacement(self, frame: int) -> Displacement:
@@ -425,11 +431,8 @@ class Maps(Portable):
                 one.with_arrays(lambda array: np.where(in_both_frames, array, np.nan))
                 for one in (displacement, self._base_displacement)
             )
-            factor = self._shared_fraction(frame)
-            shared_covariance = factor * gauges.gradient(present.smaller(base))[1]
-            gradient, covariance = _relative_gradient(
-                gauges.gradient(present), gauges.gradient(base), shared_covariance
-            )
+            shared = gauges.shared_covariance(present, base, self._shared_fraction(frame))
+            gradient, covariance = _relative_gradient(gauges.gradient(present), gauges.gradient(base), shared)
         motion = self._rigid(self._relative_displacement(frame))
         if motion is not None:
             gradient, covariance = motion.removed_gradient(gradient, covariance)

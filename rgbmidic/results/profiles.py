@@ -71,8 +71,9 @@ class Profile:
     data
         The field at each point in each frame, shape (T, P), with its standard uncertainty; NaN where not measured. Its
         arrays are `values` and `std`.
-    bias_fractions : ndarray, shape (T,)
-        Part of the variance of u or v along the line that the lights' bias leaves.
+    bias_fractions, calibration_fractions : ndarray, shape (T,)
+        Part of the noise's variance along the line that the lights' bias leaves, and part of all variance that the
+        calibration of two cameras leaves, the same along the line.
     common_fraction
         Fraction of the variance that all frames have in common.
     rate_window
@@ -117,7 +118,7 @@ class Profile:
             values=np.full((len(self.frames), len(self.line.points)), np.nan),
             std=np.full((len(self.frames), len(self.line.points)), np.nan),
         )
-        self.bias_fractions = np.zeros(len(self.frames))
+        self.bias_fractions, self.calibration_fractions = np.zeros((2, len(self.frames)))
         self.common_fraction, self.rate_window = physical.common_fraction, 0.0
         if self.field.group == "Rates" and len(self.frames) > 1:
             self.rate_window = (maps.window - 1) * float(np.median(np.diff(self.clock)))
@@ -134,9 +135,10 @@ class Profile:
         """
         for row in rows:
             nodal = maps.read(self.field.name, int(self.frames[row]))
-            variances = np.square([nodal.bias_std, nodal.uncertainty])[:, self.line.nodes]
-            bias_variance, total_variance = np.nansum(variances, axis=1)
-            self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
+            variances = np.square([nodal.bias_std, nodal.noise.uncertainty, nodal.uncertainty])[:, self.line.nodes]
+            bias, noise, total = np.nansum(variances, axis=1)
+            self.bias_fractions[row] = bias / noise if noise else 0.0
+            self.calibration_fractions[row] = 1 - noise / total if total else 0.0
             along = self.line.read(nodal, self.covariance_key)
             self.values[row], self.std[row] = along.values, along.uncertainty
 
@@ -200,7 +202,8 @@ class Profile:
             "between_frames": frame_correlation,
         }
         arrivals = arrival_times(clock, self.data, feature=feature, level=level, **options)
-        correlation = self.line.correlation(self.covariance_key, float(self.bias_fractions.mean()))
+        fractions = float(self.bias_fractions.mean()), float(self.calibration_fractions.mean())
+        correlation = self.line.correlation(self.covariance_key, *fractions)
         front = fit_front(self.positions, arrivals, self.data, correlation, usable=self.line.is_two_sided, **options)
         scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
         front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))

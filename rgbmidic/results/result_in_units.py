@@ -454,14 +454,6 @@ class ResultInUnits(Portable):
             return np.asarray(np.fmax.reduce(error / std))
         return np.asarray(error[0] if entry.name.endswith("_error") else np.hypot(error, std)[0])
 
-    def calibrated(self, field: Field, component: Callable[[str], Field], names: tuple[str, ...]) -> Field:
-        """Add to the uncertainty of a vector's component or length what a calibration leaves; a scale's is in units."""
-        return field
-
-    def with_calibration(self, histories: Sequence[Field]) -> Sequence[Field]:
-        """Add to the uncertainty of what probes measure what a calibration leaves; a scale's is in units."""
-        return histories
-
     @property
     def exporter(self) -> Callable[[str, BinaryIO], None] | None:
         """Function that writes the result for other programs into a file; None: those of `rgbmidic.results.export`."""

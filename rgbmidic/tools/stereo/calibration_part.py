@@ -2,8 +2,8 @@
 
 A point X is where both cameras project it: with other parameters p of the cameras, the same four image coordinates are
 those of ``X + dX``, ``dX = -G (dπ/dp) dp``, with the projection π and the derivative G of the point by its coordinates
-(`Triangulation.gain`). What a calibration error leaves in a displacement is the difference of dX of both states: it is
-zero where nothing moves.
+(`Triangulation.gain`). What a calibration error leaves in a displacement u is the difference of dX of both states,
+``(∂dX/∂X) u`` to first order: it is zero where nothing moves.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rgbmidic.fields import CalibrationErrors
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
-from rgbmidic.typing import FloatArray
 
-_SAMPLED = 200
-"""Nodes over which the error of displacements is averaged."""
+_STEP = 1e-3
+"""Step of the derivative of dX over the extent of the surface (dX is smooth over the frame, by lens and pose)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,27 +28,16 @@ class CalibrationPart:
 
     Attributes
     ----------
-    pair
-        The cameras.
-    errors : ndarray, shape (22, M)
-        Of the parameters of the cameras; M is the rank of their covariance.
-    rotation : ndarray, shape (3, 3)
-        Of the axes.
-    turn : ndarray, shape (3, 3, M)
-        Of this rotation: the axes are laid through the surface, which has errors, too.
-    shape : ndarray, shape (N, 3, M)
-        Of the nodes on the undeformed surface, mm, in the axes.
+    errors
+        Of the nodes on the undeformed surface, and of their displacement over the displacement, in the axes, mm; M is
+        the rank of the covariance of the cameras.
     length_std : float
         Relative standard uncertainty of lengths on the surface.
     epipolar_std : float
         Standard uncertainty of the epipolar residual, px, rms over the nodes.
     """
 
-    pair: CameraPair
-    errors: FloatArray
-    rotation: FloatArray
-    turn: FloatArray
-    shape: FloatArray
+    errors: CalibrationErrors
     length_std: float
     epipolar_std: float
 
@@ -75,77 +64,29 @@ class CalibrationPart:
         slopes = pair.parameter_slopes(points) @ errors
         shift = -surface.gain @ slopes
         at_rest = Axes.of(axes, mesh, points)
+        # the axes are laid through the surface, which has errors, too
         moved = [[Axes.of(axes, mesh, points + sign * step) for sign in (1, -1)] for step in np.moveaxis(shift, 2, 0)]
         turn, origin = (
             np.array([(getattr(plus, name) - getattr(minus, name)) / 2 for plus, minus in moved]).reshape(-1, *size)
             for name, size in (("rotation", (3, 3)), ("origin", (3,)))
         )
-        turn, origin = np.moveaxis(turn, 0, 2), origin.T
-        shape = np.einsum("ij,njm->nim", at_rest.rotation, shift - origin)
-        shape += np.einsum("ijm,nj->nim", turn, points - at_rest.origin)
+        shape = np.einsum("ij,njm->min", at_rest.rotation, shift - origin.T)
+        shape += np.einsum("mij,nj->min", turn, points - at_rest.origin)
+        step, weights = (
+            _STEP * float(np.linalg.norm(np.ptp(points, axis=0))),
+            np.eye(4)[None].repeat(len(points), axis=0),
+        )
+        before, *after = (
+            -triangulate(pair, *pair.project(places), weights).gain @ (pair.parameter_slopes(places) @ errors)
+            for places in (points, *(points + step * axis for axis in at_rest.rotation))
+        )
+        gain = np.stack([np.einsum("ij,njm->min", at_rest.rotation, (one - before) / step) for one in after], axis=2)
+        gain += (turn @ at_rest.rotation.T)[..., None]
         centred = points - points.mean(axis=0)
         growth = np.einsum("nj,njm->m", centred, shift) / (centred**2).sum()
         epipolar = np.einsum("ni,nim->nm", surface.epipolar, slopes)
         return cls(
-            pair=pair,
-            errors=errors,
-            rotation=at_rest.rotation,
-            turn=turn,
-            shape=shape,
+            errors=CalibrationErrors(surface=shape, gain=gain),
             length_std=float(np.linalg.norm(growth)),
             epipolar_std=float(np.sqrt((epipolar**2).sum(axis=1).mean())),
         )
-
-    def displacement(self, reference: Triangulation, deformed: Triangulation) -> FloatArray:
-        """Return the errors (N, 3, M) of displacements, mm, in the axes.
-
-        Parameters
-        ----------
-        reference, deformed
-            The nodes in both states, triangulated with the same weights.
-
-        Returns
-        -------
-        ndarray, shape (N, 3, M)
-        """
-        before, after = (
-            -state.gain @ (self.pair.parameter_slopes(state.points) @ self.errors) for state in (reference, deformed)
-        )
-        turned = np.einsum("ijm,nj->nim", self.turn, deformed.points - reference.points)
-        return np.asarray(np.einsum("ij,njm->nim", self.rotation, after - before) + turned)
-
-    def mean_gain(self, points: FloatArray) -> FloatArray:
-        """Return the errors (3, 3, M) of a displacement along the first index per mm along the second, over the nodes.
-
-        It is smooth over the frame, by lens and pose, so that their mean serves for any place.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            Nodes, mm, left camera's axes.
-
-        Returns
-        -------
-        ndarray, shape (3, 3, M)
-        """
-        sampled = points[:: len(points) // _SAMPLED + 1]
-        length = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))  # any that is short against the distance
-        weights = np.eye(4)[None].repeat(len(sampled), axis=0)
-        steps = [np.zeros(3), *(length * self.rotation)]
-        rest, *moved = (triangulate(self.pair, *self.pair.project(sampled + step), weights) for step in steps)
-        return np.stack([self.displacement(rest, state).mean(axis=0) / length for state in moved], axis=1)
-
-
-def covariance_of(errors: FloatArray) -> FloatArray:
-    """Return the covariance (N, 3, 3) that errors (N, 3, M) of unit variance make.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (N, 3, M)
-        Independent ones.
-
-    Returns
-    -------
-    ndarray, shape (N, 3, 3)
-    """
-    return np.asarray(errors @ errors.transpose(0, 2, 1))

@@ -103,6 +103,19 @@ class CameraPair:
         return float(np.degrees(np.arccos(np.clip(self.poses[1][0][2, 2], -1, 1))))
 
     @property
+    def exchanged(self) -> Self:
+        """The pair with the right camera as the left one, taken as exact."""
+        turn, shift = self.poses[1]
+        return replace(
+            self,
+            left=self.right,
+            right=self.left,
+            rotation=-self.rotation,
+            translation=-turn.T @ shift,
+            covariance=np.zeros_like(self.covariance),
+        )
+
+    @property
     def parameters(self) -> FloatArray:
         """Values (22,) of `PAIR_PARAMETERS`."""
         assert self.left.lens is not None

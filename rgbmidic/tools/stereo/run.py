@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
 from rgbmidic.disk import check_file, write_complete, write_errors
-from rgbmidic.errors import InputError
+from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields import MEASURES
 from rgbmidic.frames import Window
 from rgbmidic.illumination import IlluminationImages
@@ -36,7 +37,7 @@ from rgbmidic.tools.stereo.left_result import LeftResult
 from rgbmidic.tools.stereo.result import StereoResult
 from rgbmidic.tools.stereo.shape import Shape, nodal_values
 from rgbmidic.tools.stereo.stereo_file import STEREO_FILE, write_stereo
-from rgbmidic.typing import AnyArray, ProgressCallback
+from rgbmidic.typing import AnyArray, IntArray, ProgressCallback
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +135,12 @@ class _Test:
         return [(index - selected.start) / selected.step for index in self.settings.frames.reference]
 
     @property
+    def numbers(self) -> IntArray:
+        """Number of each frame, counted from the first that is measured."""
+        selected = self.series.selected
+        return np.array([self.series.numbers[index] - self.series.numbers[selected[0]] for index in selected])
+
+    @property
     def times(self) -> AnyArray | None:
         """Time of each frame in s from the trigger, (T,); None where the camera does not state it."""
         stamps = [self.series.time_ns(index) for index in self.series.selected]
@@ -183,11 +190,14 @@ def measure_stereo(
     RgbmidicError
         As `rgbmidic.measure`; or both tests contradict each other or the cameras.
     """
-    out = Path(out)
-    file = out / STEREO_FILE
+    out, pair = Path(out), camera if isinstance(camera, CameraPair) else CameraPair.read(camera)
+    file, calibration = out / STEREO_FILE, json.dumps(pair.parameters.tolist())
     if file.exists():
         check_file(file, overwrite=run.get("overwrite", False) or run.get("resume", False))
-    first, second, shape = _measure_cameras((left, right), camera, out, settings, run)
+        with suppress(ResultError):  # of another version: it is triangulated again
+            if run.get("resume", False) and StereoResult.open(file).attributes["calibration"] != calibration:
+                raise InputError(f"{file} is of other cameras than {pair.name}: choose another name, or --overwrite it")
+    first, second, shape = _measure_cameras((left, right), pair, out, settings, run)
     meshes = shape.carried_mesh
     attributes = {
         "axes": shape.axes.description,
@@ -196,11 +206,10 @@ def measure_stereo(
         "gauge_px": shape.gauges.gauges.length,
         "measure": settings.measure,
         "relative_length_std": shape.calibration.length_std,
-        "calibration_gain": shape.calibration.mean_gain(shape.triangulation.points),
         "common_variance_fraction": common_variance_fraction(first),
         "left": _path_from(out, first.path),
         "right": _path_from(out, second.path),
-        "calibration": json.dumps({"name": shape.pair.name, "parameters": shape.pair.parameters.tolist()}),
+        "calibration": calibration,
     }
 
     def frames() -> Iterator[dict[str, AnyArray]]:
@@ -325,6 +334,9 @@ def _check(pair: CameraPair, tests: tuple[_Test, _Test]) -> None:
             logger.warning(
                 f"{test.name}: its scale in the plane does not enter, lengths in space are those of {pair.name}"
             )
+    meshes = [{**asdict(mesh), "error": None} for mesh in (right.settings.mesh, left.settings.mesh, MeshSettings())]
+    if right.result is None and meshes[0] not in meshes[1:]:
+        raise InputError(f"{right.name}: its mesh is that of {left.name}, carried over: state the same [mesh], or none")
     pair.check((left.series.shape, right.series.shape))
     pair.check_lights((left.lights, right.lights))
     counts = [len(test.series.selected) for test in tests]
@@ -351,10 +363,16 @@ def _check_times(tests: tuple[_Test, _Test], pairing: str) -> None:
     """Refuse frames of both cameras that were not taken at one time; say that they are paired by number."""
     left, right = tests
     times = left.times, right.times
-    if pairing == "number":
-        return
-    if times[0] is None or times[1] is None:
-        logger.warning("frames of both cameras are paired by number: not every frame of both has a time stamp")
+    if pairing == "number" or times[0] is None or times[1] is None:
+        if pairing != "number":
+            logger.warning("frames of both cameras are paired by number: not every frame of both has a time stamp")
+        differ = np.flatnonzero(left.numbers != right.numbers)
+        if len(differ):
+            numbers = f"{left.numbers[differ[0]]} and {right.numbers[differ[0]]}"
+            raise InputError(
+                f"frames {differ[0]} of {left.name} and {right.name} have the numbers {numbers}, counted from the "
+                "first: one of the cameras has lost frames; leave out the same ones of the other"
+            )
         return
     delays = np.abs(times[1] - times[0])
     interval = float(np.median(np.diff(times[0]))) if len(delays) > 1 else np.inf

@@ -11,7 +11,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
-from rgbmidic.tools.stereo.calibration_part import CalibrationPart, covariance_of
+from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
 from rgbmidic.tools.stereo.surface import SurfaceGauges
@@ -112,8 +112,12 @@ class Shape:
         """
         spread = _diagonal(np.zeros_like(carried_mesh.right_std), carried_mesh.right_std)
         pixels = carried_mesh.left.nodes, carried_mesh.right.nodes
-        shape = triangulate(pair, *pixels, spread, _weights(spread))
-        if not (np.isfinite(shape.points).all() and (shape.points[:, 2] > 0).all()):
+        shape, exchanged = (
+            triangulate(cameras, *pixels, spread, _weights(spread)) for cameras in (pair, pair.exchanged)
+        )
+        if not _is_plausible(shape) and _is_plausible(exchanged):
+            raise InputError(f"LEFT and RIGHT are exchanged: their references fit the cameras of {pair.name} so only")
+        if not _is_in_front(shape):
             raise InputError(f"{pair.name}: the references of both cameras do not meet in front of the cameras")
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
@@ -124,8 +128,8 @@ class Shape:
             triangulation=shape,
             axes=axes_in_space,
             points=points,
-            covariance=axes_in_space.covariance(shape.covariance) + covariance_of(calibration.shape),
-            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, gauge, measure),
+            covariance=axes_in_space.covariance(shape.covariance) + _covariance_of(calibration.errors.surface),
+            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, calibration.errors, gauge, measure),
             calibration=calibration,
         )
 
@@ -156,14 +160,12 @@ class Shape:
         covariance = self.axes.covariance(deformed.covariance)
         gain = self.axes.rotation @ deformed.gain
         bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
-        errors = self.calibration.displacement(reference, deformed)
-        surface = self.gauges.strain(displacement, covariance, (self.calibration.shape, errors))
-        strain, calibration_covariance = surface.strain, covariance_of(errors)
-        covariance = covariance + calibration_covariance
+        surface = self.gauges.strain(displacement, covariance)
+        strain = surface.strain
+        covariance = covariance + _covariance_of(self.calibration.errors.at_nodes(displacement.T))
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
-            "calibration_covariance": calibration_covariance,
             "epipolar_change": deformed.residual - reference.residual,
             "epipolar_change_std": deformed.residual_std,
             "normal": surface.normal,
@@ -198,7 +200,7 @@ class Shape:
             yield (
                 f"the epipolar residual common to all frames is {common:.3f} px rms, stated are {common_std:.3f} px: "
                 f"the cameras do not stand as {self.pair.name} states, and the shape is in doubt by as many px: "
-                "calibrate again (rgbmidic-calibrate stereo), unless LEFT and RIGHT are exchanged"
+                "calibrate again (rgbmidic-calibrate stereo)"
             )
         deviation = np.abs(shape.residual - np.median(shape.residual))
         scatter = np.maximum(1.4826 * np.median(deviation), shape.residual_std)
@@ -217,10 +219,25 @@ class Shape:
             )
 
 
+def _is_in_front(surface: Triangulation) -> bool:
+    return bool(np.isfinite(surface.points).all() and (surface.points[:, 2] > 0).all())
+
+
+def _is_plausible(surface: Triangulation) -> bool:
+    """Report whether the rays of a surface meet in front of the cameras but for what is not worth a warning."""
+    rms, std = (np.sqrt(np.mean(array**2)) for array in (surface.residual, surface.residual_std))
+    return _is_in_front(surface) and bool(rms <= max(LIMITS.residual, LIMITS.factor * std))
+
+
 def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:
     """Read what `Shape.frame` needs of some nodes of a frame."""
     values = result.table.read(frame, [*MATCHED, "number", "status"])
     return {name: values[name][nodes] if name in MATCHED else values[name] for name in values}
+
+
+def _covariance_of(errors: FloatArray) -> FloatArray:
+    """Return the covariance (N, 3, 3) of independent errors (M, 3, N) of unit variance."""
+    return np.asarray(np.einsum("min,mjn->nij", errors, errors))
 
 
 def _weights(covariance: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rgbmidic.tools.stereo.shape import Shape
 
 STEREO_FILE = "stereo.vtkhdf"
-SCHEMA, VERSION = "rgbmidic-stereo-result", 2
+SCHEMA, VERSION = "rgbmidic-stereo-result", 3
 _NODE, _STATUS = ("node",), ("measured", "not seen", "decorrelated", "filled")
 _DOUBLE: dict[str, Any] = {"dtype": np.float64}
 
@@ -34,7 +34,9 @@ def _with_std(names: Iterable[str], unit: str, text: str, **changes: Any) -> lis
     return [entry for value in values for entry in (value, replace(value.uncertainty, dtype=np.float32))]
 
 
+_PARAMETERS = len(PAIR_PARAMETERS)
 _ERRORS = "errors of x, y, z by independent errors of unit variance of the calibration, part of shape_covariance"
+_GAIN = "errors of u, v, w by the same, over u, v and w (the second axis), part of displacement_covariance"
 _BIAS = "part of {}_std left by the bias of the lights, alike over some 24 px; 0 where there is none"
 SHARED = [
     ResultQuantity("x_left", _NODE, "px", "", "node in the left reference, to the right", **_DOUBLE),
@@ -44,7 +46,8 @@ SHARED = [
     ResultQuantity("left_node", _NODE, "", "", "index of the node in the left result", dtype=np.int32),
     *_with_std("xyz", "mm", "coordinate {} of the undeformed surface", **_DOUBLE),
     ResultQuantity("shape_covariance", ("node", 3, 3), "mm^2", "", "covariance of x, y, z"),
-    ResultQuantity("shape_errors", ("node", 3, len(PAIR_PARAMETERS)), "mm", "", _ERRORS),
+    ResultQuantity("shape_errors", ("node", 3, _PARAMETERS), "mm", "", _ERRORS),
+    ResultQuantity("displacement_gain", ("node", 3, 3, _PARAMETERS), "", "", _GAIN),
     *_with_std(["epipolar_common"], "px", "epipolar residual of the reference states, common to all frames"),
 ]
 """Quantities that all frames share."""
@@ -55,7 +58,6 @@ _OF_FRAMES = [
     ResultQuantity("reference", (), "", "", "1 for a frame of the reference", dtype=np.uint8, blank=0),
     *_with_std("uvw", "mm", "displacement {} of the surface", **_DOUBLE),
     ResultQuantity("displacement_covariance", ("node", 3, 3), "mm^2", "", "covariance of u, v, w"),
-    ResultQuantity("calibration_covariance", ("node", 3, 3), "mm^2", "", "part of the calibration in it"),
     *(ResultQuantity(f"{name}_bias_std", _NODE, "mm", "", _BIAS.format(name), kind="positive") for name in "uvw"),
     *_with_std(["exx", "eyy", "exy"], "", "surface strain {} in the tangent plane"),
     *_with_std(["e1", "e2"], "", "principal surface strain {}"),
@@ -120,7 +122,7 @@ def write_stereo(
         out["time"].attrs["units"] = "1" if times is None else "s"
         out["node"] = np.arange(len(meshes.nodes), dtype=np.int32)
         out["element"] = np.arange(len(meshes.left.elements), dtype=np.int32)
-        for name, length in {"corner": 3, "row": 3, "column": 3, "parameter": len(PAIR_PARAMETERS)}.items():
+        for name, length in {"corner": 3, "row": 3, "column": 3, "parameter": _PARAMETERS}.items():
             out[name] = np.arange(length, dtype=np.int32)
         for name in ("time", "node", "element", "corner", "row", "column", "parameter"):
             out[name].make_scale(name)
@@ -153,8 +155,10 @@ def _shared_values(shape: Shape) -> dict[str, AnyArray]:
     meshes, triangulated = shape.carried_mesh, shape.triangulation
     std = np.sqrt(np.maximum(np.diagonal(shape.covariance, axis1=1, axis2=2), 0))
     values: dict[str, AnyArray] = {"left_node": meshes.nodes, "shape_covariance": shape.covariance}
-    errors = shape.calibration.shape
-    values["shape_errors"] = np.pad(errors, ((0, 0), (0, 0), (0, len(PAIR_PARAMETERS) - errors.shape[2])))
+    errors = shape.calibration.errors
+    for name, array in {"shape_errors": errors.surface, "displacement_gain": errors.gain}.items():
+        by_node = np.moveaxis(array, (0, -1), (-1, 0))
+        values[name] = np.pad(by_node, [(0, 0)] * (array.ndim - 1) + [(0, _PARAMETERS - len(array))])
     values |= {"epipolar_common": triangulated.residual, "epipolar_common_std": triangulated.residual_std}
     for side, mesh in (("left", meshes.left), ("right", meshes.right)):
         values |= {f"x_{side}": mesh.nodes[:, 0], f"y_{side}": mesh.nodes[:, 1]}

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rgbmidic.field import Displacement
-from rgbmidic.fields import NodalCovariance, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields import CalibrationErrors, NodalCovariance, Strain, StrainGauges
 from rgbmidic.fields.strain import length_of
-from rgbmidic.fields.tangent_plane import gradient_errors, in_tangent_plane, measured_slopes, normals, tangent_axes
+from rgbmidic.fields.tangent_plane import measured_slopes, normals, tangent_axes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
@@ -46,7 +46,7 @@ class SurfaceGauges:
     Attributes
     ----------
     gauges
-        On the mesh in px of the left frame, with the undeformed surface in space.
+        On the mesh in px of the left frame, with the undeformed surface in space and the calibration's errors.
     measure
         Strain measure, as of `rgbmidic.fields.strain_of`.
     """
@@ -56,7 +56,12 @@ class SurfaceGauges:
 
     @classmethod
     def around_nodes(
-        cls, mesh: Tri3Mesh, points: FloatArray, length: float | None = None, measure: str = "green-lagrange"
+        cls,
+        mesh: Tri3Mesh,
+        points: FloatArray,
+        calibration: CalibrationErrors | None = None,
+        length: float | None = None,
+        measure: str = "green-lagrange",
     ) -> SurfaceGauges:
         """Lay a gauge around every node; errors as `rgbmidic.fields.strain_of`.
 
@@ -66,6 +71,8 @@ class SurfaceGauges:
             The N nodes in px of the left frame.
         points : ndarray, shape (N, 3)
             The undeformed surface at the nodes, mm, in the axes of the result.
+        calibration
+            Errors that the calibration makes at the nodes; None: the cameras are exact.
         length
             Length of the gauges in px of the left frame; None: the shortest, three elements.
         measure
@@ -75,12 +82,10 @@ class SurfaceGauges:
         -------
         SurfaceGauges
         """
-        covariance = replace(NodalCovariance.from_mesh(mesh), surface=points)
+        covariance = replace(NodalCovariance.from_mesh(mesh), surface=points, calibration=calibration)
         return cls(gauges=StrainGauges.at_nodes(covariance, length), measure=measure)
 
-    def strain(
-        self, displacement: FloatArray, covariance: FloatArray, errors: tuple[FloatArray, FloatArray] | None = None
-    ) -> SurfaceStrain:
+    def strain(self, displacement: FloatArray, covariance: FloatArray) -> SurfaceStrain:
         """Compute strain and attitude of the deformed surface.
 
         Parameters
@@ -90,9 +95,6 @@ class SurfaceGauges:
         covariance : ndarray, shape (N, 3, 3)
             Of the displacement by the match, mm^2; nodes are independent. The match's error of the undeformed shape
             changes strain by its relative error, which is left out.
-        errors : two of ndarray, shape (N, 3, M), optional
-            Errors of the undeformed surface and of the displacement that M independent errors of unit variance of the
-            calibration make, mm: all nodes have them together. None: the cameras are exact.
 
         Returns
         -------
@@ -108,20 +110,24 @@ class SurfaceGauges:
         )
         slopes, of_slopes = self.gauges.slopes_of(field)
         tangents = self.gauges.tangents(field.is_measured)
-        gradient, spread = in_tangent_plane(tangents, slopes, of_slopes)
-        if errors is not None:
-            of_shape, of_displacement = (np.moveaxis(self.gauges.fit(one, field.is_measured), 2, 0) for one in errors)
-            of_gradient = gradient_errors(tangents, slopes, of_shape, of_displacement)
-            spread = spread + np.einsum("mgi,mgj->gij", of_gradient, of_gradient)
-        strain = strain_of_gradient(gradient, spread, self.measure)
+        strain = self.gauges.strain(field, self.measure)
         tangents, slopes, valid = measured_slopes(tangents, slopes)
         axes, normal = tangent_axes(tangents), normals(tangents + slopes)
         # to first order the normal turns by the slopes along it
         to_axes = np.linalg.inv(axes.transpose(0, 2, 1) @ tangents)
         change = np.einsum("gi,gdf->gfid", normal, to_axes).reshape(-1, 2, 6)
         of_tilt = change @ np.where(valid[:, None, None], of_slopes, 0) @ change.transpose(0, 2, 1)
-        sine, sine_std = length_of(np.einsum("gi,gia->ga", normal, axes), of_tilt)
+        leaning = _leaning(tangents, slopes)
+        errors = zip(*map(np.nan_to_num, self.gauges.slope_errors(field)), strict=True)
+        changed = [_leaning(tangents + of_surface, slopes + of_motion) - leaning for of_surface, of_motion in errors]
+        of_tilt += np.einsum("mga,mgb->gab", *[np.reshape(changed, (-1, *leaning.shape))] * 2)
+        sine, sine_std = length_of(leaning, of_tilt)
         arrays = np.degrees(np.arcsin(np.minimum(sine, 1))), np.degrees(sine_std)
         normal[~valid] = np.nan
         tilt, tilt_std = (np.where(valid, array, np.nan) for array in arrays)
         return SurfaceStrain(strain=strain, normal=normal, tilt=tilt, tilt_std=tilt_std)
+
+
+def _leaning(tangents: FloatArray, slopes: FloatArray) -> FloatArray:
+    """Return the components (G, 2) of the deformed normal along the axes of the undeformed tangent plane."""
+    return np.asarray(np.einsum("gi,gia->ga", normals(tangents + slopes), tangent_axes(tangents)))

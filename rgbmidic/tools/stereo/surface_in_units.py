@@ -6,8 +6,7 @@ space.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, BinaryIO, ClassVar, Literal, Self
@@ -16,7 +15,7 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.field import Displacement, Field
-from rgbmidic.fields import NodalCovariance, Rectification, StrainGauges, Units
+from rgbmidic.fields import CalibrationErrors, NodalCovariance, Rectification, StrainGauges, Units
 from rgbmidic.fields.strain import STRAIN
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results import ResultQuantity
@@ -39,8 +38,7 @@ _SPACE: dict[str, Literal["displacement", "strain"]] = {
     "epipolar_change": "displacement",
 }
 """Quantities of the file, with their standard uncertainty, that maps show as they are, with their kinds."""
-_COMPONENT = re.compile(r"(.+_)([uvw])((?:_velocity|_acceleration)?(?:_before|_after)?)")
-"""Name of a component of a vector that a probe measures: probe, component, rate."""
+_BIASES = ("u_bias_std", "v_bias_std", "w_bias_std")
 _ROUNDING = 1e-6
 """Part of a variance that is left at least where the calibration's is taken off it: single precision (derived)."""
 
@@ -83,6 +81,11 @@ class SurfaceInUnits(ResultInUnits):
                 f"lengths of {result.path} are those in space, mm; for px read the result of a camera, "
                 f"{result.left.path}"
             )
+        if scale is not None and (scale.mm_per_pixel is not None or scale.camera is not None):
+            raise InputError(
+                f"lengths of {result.path} are those in space: mm_per_pixel and camera of [scale] are of one camera, "
+                "leave them out"
+            )
         mesh, points = Tri3Mesh(nodes=result.nodes, elements=result.elements), _points(result)
         corners = points[mesh.elements]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
@@ -99,10 +102,15 @@ class SurfaceInUnits(ResultInUnits):
     @cached_property
     def covariance(self) -> NodalCovariance:
         """Covariance of the nodes' errors, with the surface in space and what its match leaves of it."""
-        errors = np.asarray(self.result.stereo["shape_errors"], dtype=np.float64)
-        matched = self.result.stereo["shape_covariance"] - errors @ errors.transpose(0, 2, 1)
+        stereo = self.result.stereo
+        shape, gain = (np.moveaxis(stereo[name], (0, -1), (-1, 0)) for name in ("shape_errors", "displacement_gain"))
+        causes = shape.any(axis=(1, 2))
+        errors = CalibrationErrors(surface=shape[causes].astype(np.float64), gain=gain[causes].astype(np.float64))
+        matched = np.moveaxis(stereo["shape_covariance"], 0, 2) - np.einsum(
+            "min,mjn->ijn", errors.surface, errors.surface
+        )
         nodal = NodalCovariance.from_mesh(self.mesh)
-        return replace(nodal, surface=self.points, surface_covariance=np.moveaxis(matched, 0, 2))
+        return replace(nodal, surface=self.points, surface_covariance=matched, calibration=errors)
 
     @cached_property
     def gauges(self) -> StrainGauges:
@@ -120,10 +128,7 @@ class SurfaceInUnits(ResultInUnits):
         attributes = self.result.stereo.attributes
         yield f"u, v, w are along the axes {attributes['axes']}; lengths are those in space"
         yield "places are in px of the left camera's reference; a scale in mm per px is the mean over the surface"
-        relative = float(attributes["relative_length_std"])
-        yield f"the calibration leaves {100 * relative:.2g} % of every length"
-        if relative:
-            yield "strain over a gauge is stated without what the calibration leaves of it; that of the file has it"
+        yield f"the calibration leaves {100 * float(attributes['relative_length_std']):.2g} % of every length"
 
     @cached_property
     def quantities(self) -> dict[str, ResultQuantity]:
@@ -140,16 +145,18 @@ class SurfaceInUnits(ResultInUnits):
 
     def displacement(self, frame: int) -> Displacement:
         """Read the displacement of all nodes in a frame, mm, without the part of the calibration in its uncertainty."""
-        values, total, of_calibration, bias = self._read(frame)
-        covariance = total - of_calibration
-        std = np.sqrt(np.maximum(np.einsum("nii->in", covariance), _ROUNDING * np.einsum("nii->in", total)))
+        arrays = self.result.stereo.frame([*self.components, "displacement_covariance", *_BIASES], frame)
+        values, bias = (np.stack([arrays[name] for name in names]) for names in (self.components, _BIASES))
+        total, errors = np.moveaxis(arrays["displacement_covariance"], 0, 2), self._errors.at_nodes(values)
+        covariance = total - np.einsum("min,mjn->ijn", errors, errors)
+        std = np.sqrt(np.maximum(np.einsum("iin->in", covariance), _ROUNDING * np.einsum("iin->in", total)))
         return Displacement(
             unit="mm",
             dims=("component", "node"),
-            values=values.T,
+            values=values,
             std=std,
-            bias=np.minimum(bias.T, std),
-            covariance=np.moveaxis(covariance, 0, 2),
+            bias=np.minimum(bias, std),
+            covariance=covariance,
         )
 
     def field(self, name: str, frame: int) -> Field:
@@ -161,8 +168,8 @@ class SurfaceInUnits(ResultInUnits):
             std = arrays[1] if name == base else None
             return Field(name=name, unit=entry.unit, dims=("node",), values=arrays[0], std=std)
         if name in self.components:
-            by_name = {one.name: one for one in self.displacement(frame).components}
-            return self.calibrated(by_name[name], by_name.__getitem__, (name,))
+            displacement, row = self.displacement(frame), self.components.index(name)
+            return displacement.components[row].with_common(self._errors.at_nodes(displacement.values)[:, row])
         return super().field(name, frame)
 
     def frame(self, index: int) -> dict[str, AnyArray]:
@@ -179,68 +186,11 @@ class SurfaceInUnits(ResultInUnits):
         """The file of the result has all that is exported."""
         return self.result.stereo.export
 
-    def calibrated(self, field: Field, component: Callable[[str], Field], names: tuple[str, ...]) -> Field:
-        """Add what the calibration leaves in a displacement or its rate, all places of which have it in common.
-
-        Parameters
-        ----------
-        field
-            Component, or length, of a vector.
-        component
-            Gives each component of the vector by its name, of the same shape.
-        names
-            Components that the field is the length of.
-
-        Returns
-        -------
-        Field
-        """
-        values = np.stack([component(name).values for name in self.components])
-        weights = np.zeros_like(values)
-        for row in map(self.components.index, names):
-            weights[row] = 1.0 if len(names) == 1 else values[row] / np.maximum(field.values, np.finfo(float).tiny)
-        common = np.linalg.norm(np.einsum("ijk,i...,j...->k...", self._gain, weights, values), axis=0)
-        bias = None if field.bias is None else np.hypot(field.bias, common)
-        return replace(field, std=np.hypot(field.uncertainty, common), bias=bias)
-
-    def with_calibration(self, histories: Sequence[Field]) -> tuple[Field, ...]:
-        """Add what the calibration leaves in what probes measure.
-
-        Parameters
-        ----------
-        histories
-            Of all probes.
-
-        Returns
-        -------
-        tuple of Field
-        """
-        by_name = {history.name: history for history in histories}
-        return tuple(self._with_calibration(history, by_name) for history in histories)
-
-    def _with_calibration(self, history: Field, by_name: Mapping[str, Field]) -> Field:
-        if (match := _COMPONENT.fullmatch(history.name)) is not None:
-            vector = {name: by_name.get(f"{match[1]}{name}{match[3]}") for name in self.components}
-            known = {name: field for name, field in vector.items() if field is not None}
-            if len(known) == len(vector):
-                return self.calibrated(history, known.__getitem__, (match[2],))
-        if not history.unit.startswith("mm"):
-            return history
-        relative = float(self.result.stereo.attributes["relative_length_std"])
-        return replace(history, std=np.hypot(history.uncertainty, relative * history.values))
-
     @property
-    def _gain(self) -> FloatArray:
-        return np.asarray(self.result.stereo.attributes["calibration_gain"], dtype=np.float64)
-
-    def _read(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Read the displacement (N, 3), its covariance (N, 3, 3), the calibration's part, the lights' bias (N, 3)."""
-        biases = [f"{name}_bias_std" for name in self.components]
-        covariances = ["displacement_covariance", "calibration_covariance"]
-        arrays = self.result.stereo.frame([*self.components, *covariances, *biases], frame)
-        values, bias = (np.stack([arrays[name] for name in names], axis=1) for names in (self.components, biases))
-        total, of_calibration = (np.asarray(arrays[name], dtype=np.float64) for name in covariances)
-        return values, total, of_calibration, bias.astype(np.float64)
+    def _errors(self) -> CalibrationErrors:
+        errors = self.covariance.calibration
+        assert errors is not None
+        return errors
 
 
 def _points(result: LeftResult) -> FloatArray:

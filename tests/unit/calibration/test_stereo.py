@@ -98,6 +98,8 @@ def test_the_details_state_residuals_and_views_held_out():
     assert details["held_out"]["epipolar_px"] == pytest.approx(0.03 * np.sqrt(2), rel=0.5)
     assert abs(details["held_out"]["relative_length_error"]) < 1e-3
     assert len(estimate.residuals) == 8
+    covariance = estimate.pair.covariance  # in px, rad and mm: of unlike size, and yet symmetric
+    assert (covariance == covariance.T).all()
 
 
 def test_boards_numbered_from_opposite_ends_are_numbered_alike():
@@ -184,6 +186,7 @@ def test_the_command_calibrates_checks_and_shows(photographs, capsys):
     [
         (["stereo", *options("views", **{"--right": "views/right_[0-5].tif"})], "has 8 photographs, the right 6"),
         (["stereo", *options("views", **{"--right": "none/*.tif"})], "right: "),
+        (["stereo", *options("views", **{"--right": "views/left_*.tif"})], "both cameras stand at one place"),
         (["stereo", *options("check")], "5 simultaneous views of the target at least"),
         (["stereo", *options("views"), "--left-calibration", "a.json"], "belong together"),
         (["stereo", *options("views"), "--out", "stereo.json"], "exists already"),

@@ -84,8 +84,8 @@ def test_nothing_moves_nothing_is_uncertain():
     points = Motion().points(Motion().material(pair, 0, MESH.nodes))
     seen = triangulate(pair, *pair.project(points), np.eye(4)[None].repeat(len(points), axis=0))
     part = CalibrationPart.of(pair, MESH, seen, "plane")
-    assert part.shape.any()
-    assert not part.displacement(seen, seen).any()
+    assert part.errors.surface.any()
+    assert not part.errors.at_nodes(np.zeros((3, len(points)))).any()
 
 
 def test_exact_cameras_leave_nothing():
@@ -93,5 +93,5 @@ def test_exact_cameras_leave_nothing():
     points = Motion().points(Motion().material(pair, 0, MESH.nodes))
     seen = triangulate(pair, *pair.project(points), np.eye(4)[None].repeat(len(points), axis=0))
     part = CalibrationPart.of(pair, MESH, seen, "plane")
-    assert not part.shape.any()
+    assert not part.errors.surface.any()
     assert part.length_std == 0

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stereo_scene import DISTANCE, MOTIONS, SHAPE, Motion, image
+from stereo_scene import DISTANCE, EDGE, MOTIONS, SHAPE, Motion, image, pair_of
 
 from rgbmidic import Region, Result, Tri3Mesh
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
@@ -115,6 +115,8 @@ def test_a_left_result_is_taken_and_an_interrupted_one_gone_on_with(measured, pa
     again = measure_stereo(*tests, pair, tmp_path / "result", settings, resume=True, workers=1)
     there = [folder / "result" / side for side in ("left", "right")]
     taken = measure_stereo(*there, pair, tmp_path / "other", settings)
+    with pytest.raises(InputError, match="is of other cameras than"):
+        measure_stereo(*there, replace(pair, translation=2 * pair.translation), tmp_path / "other", resume=True)
     for other in (again, taken):
         for name in ("z", "w", "exx", "epipolar_change"):
             assert np.array_equal(other[name], result[name], equal_nan=True), name
@@ -136,6 +138,7 @@ CONTRADICTIONS = {
     "frames": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nlast = 1', "as many frames"),
     "references": ('path = "frame_*.tif"', 'path = "frame_*.tif"\nreference = 1', "must name the same states"),
     "region": ("[0, 0, 159, 119]", "[0, 0, 20, 20]", "no element of the left mesh"),
+    "mesh": ("element_size = 16", "element_size = 24", r"state the same \[mesh\], or none"),
 }
 
 
@@ -186,6 +189,24 @@ def test_frame_rates_and_times_that_differ_are_refused(measured, pair, tmp_path,
         measure_stereo(*tests, pair, tmp_path / "result")
 
 
+def test_frames_that_one_camera_lost_are_refused(measured, pair, tmp_path):
+    folder, _ = measured
+    shutil.copytree(folder / "right", tmp_path / "right")
+    (tmp_path / "right/frame_2.tif").rename(tmp_path / "right/frame_7.tif")
+    with pytest.raises(InputError, match=r"frames 2 of .* have the numbers 2 and 7, counted from the first"):
+        measure_stereo(folder / "left/TEST.toml", tmp_path / "right/TEST.toml", pair, tmp_path / "result")
+
+
+def test_exchanged_cameras_are_refused(measured, pair, tmp_path):
+    """The references fit in the other order only: of the left result as the right one there is nothing to measure."""
+    folder, _ = measured
+    there = [folder / "result" / side for side in ("left", "right")]
+    with pytest.raises(InputError, match="LEFT and RIGHT are exchanged"):
+        measure_stereo(*there, pair.exchanged, tmp_path / "result")
+    assert not (tmp_path / "result").exists()
+    assert pair.exchanged.exchanged.parameters == pytest.approx(pair.parameters)
+
+
 def test_another_size_is_refused(measured, pair, tmp_path):
     folder, _ = measured
     other = replace(pair, right=replace(pair.right, shape=(240, 320)))
@@ -221,6 +242,23 @@ def test_a_mesh_is_carried_beyond_the_reach_of_the_search(pair):
     assert len(carried.nodes) == len(mesh.nodes)
     assert np.abs(carried.right.nodes - true).max() < 0.05
     assert carried.right.nodes[:, 0].min() > 250
+
+
+@pytest.mark.parametrize("step", [0.0, 0.4, 1.0])
+def test_a_step_in_depth_that_elements_lie_across_is_reported(step):
+    """An edge that no crack states: without a word nodes beside it were off by 1.6 to 2.5 times what is stated."""
+    pair, plate = pair_of(20.0), Motion(step=step)
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((15, 15, 145, 105), shape=SHAPE), 20)
+    noise = np.random.default_rng(0).normal(scale=8, size=(2, *SHAPE))
+    warnings = carry_mesh(images_of(*(image(pair, side, plate) + noise[side] for side in (0, 1))), mesh).warnings
+    if not step:
+        assert warnings == ()
+        return
+    x0, x1 = map(
+        float, re.search(r"across a step in depth, .* from \((\d+), \d+\) to \((\d+), \d+\)", warnings[0]).groups()
+    )
+    ((edge, _),) = pair.project(plate.points(np.array([[EDGE, 0.0]])))[0]
+    assert edge - 25 < x0 < edge < x1 < edge + 25
 
 
 def test_other_lights_are_refused(pair):

@@ -53,7 +53,7 @@ def test_a_stretch_of_a_plate_that_turns_is_exact(measure):
 def test_noise_of_nodes_that_are_correlated_as_those_of_a_fit_is_stated():
     random, ratios, tilts = np.random.default_rng(0), [], []
     motion = Motion(degrees=(1, 2, 3))
-    gauges = SurfaceGauges.around_nodes(MESH, REST, 70.0)
+    gauges = SurfaceGauges.around_nodes(MESH, REST, length=70.0)
     from rgbmidic.fields import NodalCovariance
 
     fit = NodalCovariance.from_mesh(MESH).fit
