@@ -90,7 +90,7 @@ class Weighting:
 @stage("weights")
 def initial_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
     """Return the weighting at the initial guess, where the `residual` may be known."""
-    residual = residual or compare(problem, estimate)
+    residual = residual or compare(problem, estimate, problem.reference)
     matched = matching_elements(residual, estimate.displacement, min_zncc=problem.constants.min_initial_zncc)
     return Weighting(residual=residual, matched=matched)
 
@@ -237,8 +237,7 @@ def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> S
 @stage("iteration")
 def follow(problem: Problem, last: Weighting, estimate: Estimate) -> Weighting:
     """Compare the states at an estimate, with the weights as they are."""
-    residual = compare(problem, estimate, last.residual.reference)
-    return replace(last, residual=replace(residual, weights=last.residual.weights))
+    return replace(last, residual=compare(problem, estimate, last.residual.reference, last.residual))
 
 
 @stage("search")
