@@ -181,7 +181,7 @@ def _finer_field(
     functions = refined.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
     estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
-    first = compare(problem, estimate, fine)
+    first = compare(problem, estimate)
     children = np.repeat(active, len(_CHILDREN))
     prior_weights = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
     weights, _ = _precision_weights(method, first, prior_weights)
@@ -190,7 +190,7 @@ def _finer_field(
     without, noise = np.zeros((start.size, 0)), None if method is None else prior_weights  # without rigid functions
     equations = Equations.build(fine, weights, without, start, noise)
     estimate = gauss_newton_step(problem, equations, first, estimate)
-    last = compare(problem, estimate, fine)
+    last = compare(problem, estimate)
     weights, loss = _precision_weights(method, last, prior_weights)
     equations = Equations.build(fine, weights, without, start, noise)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little

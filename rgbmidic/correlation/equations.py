@@ -332,9 +332,11 @@ class UnsolvableError(Exception):
         self.history = estimate.history()
 
 
-def compare(problem: Problem, estimate: Estimate, reference: Reference, last: Residual | None = None) -> Residual:
+def compare(
+    problem: Problem, estimate: Estimate, reference: Reference | None = None, last: Residual | None = None
+) -> Residual:
     """Return the residual at an estimate, with the problem's reference or one that has been adapted; see `Residual`."""
-    return Residual.at(reference, problem.deformed, _light_displacements(problem, estimate), last)
+    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate), last)
 
 
 @stage("iteration")

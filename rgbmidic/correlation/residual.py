@@ -138,6 +138,25 @@ class Residual:
         element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
+    def with_values(self, values: FloatImage) -> Residual:
+        """Return it for other grey levels (k, P) of the reference, with the brightness as it is.
+
+        Parameters
+        ----------
+        values : ndarray, shape (k, P), float32
+            Such as those of a reference before `Reference.filtered_as`.
+
+        Returns
+        -------
+        Residual
+        """
+        if values is self.reference.values:
+            return self
+        difference = values - self.reference.values
+        difference *= self.reference.inverse_level
+        difference += self.difference
+        return replace(self, difference=difference)
+
     def design_effect(self, difference: FloatImage, weight: FloatImage) -> FloatImage:
         """Return the variance of a residual's scores over what white noise of the same variance would give, (P,).
 

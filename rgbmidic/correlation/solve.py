@@ -90,7 +90,7 @@ class Weighting:
 @stage("weights")
 def initial_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
     """Return the weighting at the initial guess, where the `residual` may be known."""
-    residual = residual or compare(problem, estimate, problem.reference)
+    residual = residual or compare(problem, estimate)
     matched = matching_elements(residual, estimate.displacement, min_zncc=problem.constants.min_initial_zncc)
     return Weighting(residual=residual, matched=matched)
 
@@ -111,7 +111,9 @@ def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Est
             matched = _held_elements(problem, last, equations, estimate, residual, matched)
             return replace(last, residual=residual, matched=matched)
     residual = compare(problem, estimate, problem.reference.filtered_as(displacement))
-    precision = None if problem.method is None else problem.method.precision(residual)
+    # of the residual that the displacement minimises: by other grey levels it is not yet the best
+    minimised = residual.with_values(last.residual.reference.values)
+    precision = None if problem.method is None else problem.method.precision(minimised)
     matched = matching_elements(residual, displacement, precision)
     matched = _held_elements(problem, last, equations, estimate, residual, matched)
     weighting = Weighting(residual=residual, matched=matched, precision=precision, learnt_at=displacement)
