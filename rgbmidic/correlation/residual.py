@@ -39,7 +39,7 @@ class Residual:
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f.
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     gain_fit
