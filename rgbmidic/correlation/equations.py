@@ -1,7 +1,7 @@
-"""One pass of the solve: its normal equations, and the Gauss-Newton iterations with them (paper, eq. 3).
+"""The normal equations of the solve, and the Gauss-Newton iteration with them (paper, eq. 3).
 
-The normal equations hold the weighted Hessian of all lights, a weak smoothness for nodes without data, and the rigid
-motions of the lights. They are factorised once a pass; each iteration solves for the increment of the displacement.
+They hold the weighted Hessian of all lights, a weak smoothness for nodes without data, and the rigid motions of the
+lights. They are factorised once for given weights; each iteration solves for the increment of the displacement.
 """
 
 from __future__ import annotations
@@ -332,9 +332,11 @@ class UnsolvableError(Exception):
         self.history = estimate.history()
 
 
-def compare(problem: Problem, estimate: Estimate, reference: Reference | None = None) -> Residual:
-    """Return the residual at an estimate, with the problem's reference or one that has been adapted."""
-    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate))
+def compare(
+    problem: Problem, estimate: Estimate, reference: Reference | None = None, last: Residual | None = None
+) -> Residual:
+    """Return the residual at an estimate, with the problem's reference or one that has been adapted; see `Residual`."""
+    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate), last)
 
 
 @stage("iteration")

@@ -375,8 +375,7 @@ class Reference(Derivable):
         add_second_derivatives(
             factors, self.images, self.pixels.lines, self.pixels.run_offsets, first_row, first_column, values
         )
-        fit = self.gain_fit and GainFit.over(values, self.pixel_weights, self.pixels, self.gain_fit.sigma)
-        return replace(self, values=values, gain_fit=fit)
+        return replace(self, values=values)  # whose means over the window of a gain are the same
 
     def with_gain_window(self, sigma: float) -> Reference:
         """Return the reference with a gain that is smooth over a narrower window.

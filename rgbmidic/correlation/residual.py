@@ -37,7 +37,7 @@ class Residual:
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f.
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     gain_fit
@@ -61,7 +61,13 @@ class Residual:
     gain_fit: GainFit | None = None
 
     @classmethod
-    def at(cls, reference: Reference, deformed: Deformed, displacements: Sequence[FloatArray]) -> Residual:
+    def at(
+        cls,
+        reference: Reference,
+        deformed: Deformed,
+        displacements: Sequence[FloatArray],
+        last: Residual | None = None,
+    ) -> Residual:
         """At one nodal displacement (N, 2) per light.
 
         Parameters
@@ -70,6 +76,8 @@ class Residual:
             Images of both states.
         displacements : sequence of ndarray, shape (N, 2)
             Nodal displacement of every light in px.
+        last
+            Residual whose weights it takes, if they stay as they are.
 
         Returns
         -------
@@ -77,17 +85,19 @@ class Residual:
         """
         values, pixels, shape = reference.values, reference.pixels, deformed.weights.shape[1:]
         moments, difference = np.empty((len(values), len(reference.mesh.elements), 6)), np.empty_like(values)
-        is_changed = np.empty(moments.shape[:2], dtype=bool)
-        warps = list(reference.warps(deformed, displacements))
-        for lights, warp in warps:
-            find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
-        weights = reference.pixel_weights.copy() if is_changed.any() else reference.pixel_weights
+        is_changed, warps = np.zeros(moments.shape[:2], dtype=bool), list(reference.warps(deformed, displacements))
+        weights, fit = (reference.pixel_weights, reference.gain_fit) if last is None else (last.weights, last.gain_fit)
+        if last is None:
+            for lights, warp in warps:
+                find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
+        if is_changed.any():
+            weights = weights.copy()
         for lights, warp in warps:
             states = deformed.coefficients[lights], deformed.weights[lights], values[lights]
             reference_weights = reference.pixel_weights[lights], is_changed[lights]
             outputs = difference[lights], weights[lights], moments[lights]
             compare_states(*states, *reference_weights, *warp, pixels.offsets, *outputs)
-        fit, (height, width) = reference.gain_fit, pixels.bounds[2:]
+        height, width = pixels.bounds[2:]
         if fit is not None and is_changed.any():
             fit = GainFit.over(values, weights, pixels, fit.sigma)
         gain, offset = np.ones(len(values)), np.zeros((len(values), 3))

@@ -7,9 +7,9 @@ is ``u + R beta_j`` and its derivative is the light's Hessian times R. The gradi
 that of the deformed one, carried along by the deformation gradient of the surface, so the Hessian is constant as long
 as the weights are (docs: how it works).
 
-The loop is: assemble the equations, solve them by Gauss-Newton iterations, compare the states, weigh elements and
-lights; until the weights have converged; then conclude. Every step is a function from frozen states to a frozen state,
-and none depends on how many came before.
+The loop is: compare the states, weigh elements and lights where little of the motion is left, assemble the equations
+where the weights have changed, take a Gauss-Newton step; until neither changes; then conclude. Every step is a function
+from frozen states to a frozen state, and none depends on how many came before.
 """
 
 from __future__ import annotations
@@ -223,21 +223,19 @@ def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> S
         estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
         if are_final and estimate.remaining <= tolerance / 5:
             break
-        if not estimate.has_settled(problem.constants.reweight_motion):
+        if estimate.has_settled(problem.constants.reweight_motion):
+            weighting = weigh(problem, weighting, equations, estimate)
+            are_final = weighting.has_converged(equations)
+            equations = equations if are_final else assemble(problem, weighting, estimate)
+        else:
             weighting, are_final = follow(problem, weighting, estimate), False
-            continue
-        weighting = weigh(problem, weighting, equations, estimate)
-        are_final = weighting.has_converged(equations)
-        if not are_final:
-            equations = assemble(problem, weighting, estimate)
     return conclude(problem, estimate, equations, weighting)
 
 
 @stage("iteration")
 def follow(problem: Problem, last: Weighting, estimate: Estimate) -> Weighting:
     """Compare the states at an estimate, with the weights as they are."""
-    residual = compare(problem, estimate, last.residual.reference)
-    return replace(last, residual=replace(residual, weights=last.residual.weights))
+    return replace(last, residual=compare(problem, estimate, last.residual.reference, last.residual))
 
 
 @stage("search")
