@@ -222,9 +222,9 @@ def slope_operators(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, s
 _WIDTH = 0.58
 """Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
 have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's; with
-.45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45 degrees). At an
-edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times as much as the linear
-fit's, and waves at an edge were seen no better."""
+.45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45 degrees). At
+an edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times as much as the
+linear fit's, and waves at an edge were seen no better."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
