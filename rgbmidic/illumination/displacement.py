@@ -21,7 +21,7 @@ from rgbmidic.illumination.colour_factors import BLOCK, FAINTEST, ColourFactors,
 from rgbmidic.illumination.images import frame_geometry, registration_basis
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh.pixel_map import window_means
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
