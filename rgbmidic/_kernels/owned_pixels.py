@@ -182,7 +182,12 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
     products = np.empty((len(out), largest), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        n = 0
+        n, total = 0, _ZERO
+        for a in range(len(values)):
+            for i in range(number):
+                total += weights[a, first + i]
+        if total == _ZERO:
+            continue
         for a in range(len(values)):
             for i in range(number):
                 root[a, i] = np.sqrt(weights[a, first + i])

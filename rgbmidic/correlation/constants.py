@@ -150,9 +150,18 @@ class SolverConstants:
     local_bias_threshold: float = 8.0
 
     def merged_block_side(self, element: float, extent: Sequence[int] | None = None) -> int:
-        """Side (px) of the squares of blocks for elements of side `element` (px).
+        """Side (px) of the squares of blocks for elements of side `element` (px); a small region has a few across.
 
-        A region of a small `extent`, height and width in px, has a few of them across.
+        Parameters
+        ----------
+        element
+            Side of the elements, px.
+        extent
+            Height and width of the region, px; None: large.
+
+        Returns
+        -------
+        int
         """
         # of two of 19 px across the uncertainty was 1.8 times what it is
         longest = min(self.score_block_side_per_element * element, np.inf if extent is None else min(extent) // 4)

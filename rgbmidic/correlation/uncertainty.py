@@ -222,11 +222,9 @@ def gradient_disagreement(
     reference = residual.reference
     if len(equations.weights) == 1:
         return np.ones(len(std))
-    pulls = [
-        reference.assembly.vector(reference.projected(*light))
-        for light in zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
-    ]
-    pull, rigid_pull = np.sum(pulls, axis=0), (np.array(pulls[1:]) @ equations.functions).ravel()
+    projected = reference.projected(equations.weights, residual.difference, reference.texture.images)
+    pulls = np.array([reference.assembly.vector(light) for light in projected])
+    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
     step = recovery.value @ equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
     square = ((step / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
     chance = np.nan_to_num(reference.residual_leverage).mean() * table.over_elements().disagreement_by_chance()
