@@ -28,7 +28,7 @@ LIGHT_WEIGHTS: dict[str, Callable[[], PrepareWeights]] = {}
 MESH_SOURCES: dict[str, Callable[[], MeshSource]] = {}
 """Meshes of other origin, by the name under which a result keeps their document; ``mesh.file`` is "finite_elements"."""
 PREPARATIONS: dict[str, Callable[[], Callable[..., Any]]] = {}
-"""What a test finds on its own frames before it is measured, by the key of TEST.toml that asks for it."""
+"""What looks at the frames of a test before it is measured, by the key of TEST.toml that it is for."""
 FRAME_FORMATS: dict[str, Callable[[], tuple[FrameFormat, ...]]] = {}
 """Formats of frame files beside those of `rgbmidic.frames`, by the kind of their files."""
 WORKERS: dict[str, Callable[[], OpenWorkers]] = {}

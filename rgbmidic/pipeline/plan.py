@@ -25,7 +25,6 @@ from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST
-from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, without_dark_pixels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import (
@@ -384,6 +383,7 @@ def _read_reference(
         window_calibration = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
         # a camera that shakes adds to the difference of two frames: it is not the noise that is calibrated
         repeat = raw[1] if len(raw) > 1 and motion.largest < frame_quality.SUITABILITY.shake else None
+        check_state = load_extension(PREPARATIONS, "calibration.accept", "calibration.file")
         for check in check_state(
             raw[0], window_calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat
         ):

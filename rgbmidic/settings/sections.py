@@ -119,7 +119,7 @@ class IlluminationSettings(CheckedSettings):
 
 
 FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
-"""Checks of a frame against its calibration (`rgbmidic.illumination.frame_check`)."""
+"""Checks of a frame against its calibration (`rgbmidic.tools.preparation.frame_check`)."""
 
 ELEMENT_SIZE = 25.0
 """Side of the elements in px where nobody states another: the paper's (section 2.2)."""
@@ -142,7 +142,7 @@ class CalibrationSettings(CheckedSettings):
         What ``rgbmidic-calibrate`` wrote; needed for colour frames, unless a script gives its own separation.
     accept
         Checks of the reference frame against the calibration whose contradictions are accepted
-        (`rgbmidic.illumination.frame_check`).
+        (`rgbmidic.tools.preparation.frame_check`).
 
     Examples
     --------

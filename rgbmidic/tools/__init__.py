@@ -22,6 +22,7 @@ def add_to_core() -> None:
     """Add to the core what a test or a result may be of a tool, which is imported when it is needed."""
     extensions.LIGHT_WEIGHTS["geometry"] = _geometry_weights
     extensions.MESH_SOURCES["finite_elements"] = _finite_elements
+    extensions.PREPARATIONS["calibration.accept"] = _frame_check
     extensions.PREPARATIONS["mesh.element_size"] = _element_size
     extensions.PREPARATIONS["mesh.refine"] = _refinement
     extensions.PREPARATIONS["weights.threshold"] = _automatic_threshold
@@ -41,6 +42,12 @@ def _finite_elements() -> MeshSource:
     from rgbmidic.tools.finite_elements.mesh_source import MeshFile
 
     return MeshFile()
+
+
+def _frame_check() -> Callable[..., Any]:
+    from rgbmidic.tools.preparation.frame_check import check_state
+
+    return check_state
 
 
 def _element_size() -> Callable[..., Any]:

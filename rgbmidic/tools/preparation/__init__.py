@@ -1,1 +1,1 @@
-"""What a test finds on its own frames before it is measured: element size, refined mesh, threshold of the weights."""
+"""What is looked for on a test's own frames before it is measured: contradictions, element size, mesh, threshold."""
