@@ -208,7 +208,7 @@ class ProfileLine:
         near = field.isel(node=self.nodes)
         weights = self._weights(np.isfinite(near.values).tobytes())
         values = weights @ np.nan_to_num(near.values)
-        variance = self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, near.bias_std)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), near)
         std = np.where(np.isfinite(values), np.sqrt(variance), np.nan)
         return replace(field, dims=("position",), values=values, std=std, bias=None)
 
