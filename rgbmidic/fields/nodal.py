@@ -200,19 +200,21 @@ class NodalCovariance:
         flat = [array.reshape(-1, array.shape[-1]) @ factor for array, factor in factors]
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
-    def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+    def variance(self, weights: FloatArray, field: Field) -> FloatArray:
         """Compute the variance of weighted sums of nodal values.
 
         Parameters
         ----------
-        weights, std, bias : ndarray, shape (..., n)
+        weights : ndarray, shape (..., n)
             As of `errors`.
+        field
+            Of the n nodes, shape (..., n).
 
         Returns
         -------
         ndarray, shape (...)
         """
-        return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
+        return np.asarray((self.errors(weights, field.uncertainty, field.bias_std) ** 2).sum(axis=-1))
 
     def of_sums(self, weights: FloatArray, displacement: Displacement) -> FloatArray:
         """Compute the covariance of S weighted sums of each of the c components of a displacement.

@@ -200,7 +200,7 @@ class Mean:
         Field
             Of the shape (T,).
         """
-        variance = self.covariance.variance(weights, field.uncertainty, field.bias_std)
+        variance = self.covariance.variance(weights, field)
         mean = _products(weights, field.values).sum(axis=1)
         return replace(field, dims=("frame",), values=mean, std=np.sqrt(variance), bias=None)
 

@@ -155,16 +155,15 @@ class Profile:
     @property
     def positions(self) -> FloatArray:
         """Distance (P,) of the points from the first end, in the unit of lengths."""
-        return self.line.positions * self._scale
+        return self._in_units(self.line.positions)
 
     @property
     def places(self) -> FloatArray:
         """Places (P, 2) of the points on the reference, or (P, 3) in space, in the unit of lengths."""
-        return self._scale * (self.line.points if self.line.surface is None else self.line.surface)
+        return self._in_units(self.line.coordinates)
 
-    @property
-    def _scale(self) -> float:
-        return (self.units.mm_per_pixel or 1.0) if self.line.surface is None else 1.0
+    def _in_units(self, lengths: FloatArray) -> FloatArray:
+        return self.units.convert(Field(name="", unit=self.line.unit, values=lengths)).values
 
     @property
     def clock(self) -> FloatArray:

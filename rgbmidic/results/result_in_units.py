@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, ClassVar, Literal, Self
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.errors import InputError
 from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
@@ -65,7 +66,7 @@ def rectification_of(
     CalibrationError
         The camera's file is not usable, or was made with frames of another shape.
     InputError
-        The camera holds no plane.
+        The camera holds no plane, or a scale is stated beside that of a mesh of ``mesh.file``.
     """
     stated, camera = result.scale if scale is None else scale, None
     units = Units(mm_per_pixel=stated.mm_per_pixel, mm_per_pixel_std=stated.mm_per_pixel_std)
@@ -75,14 +76,15 @@ def rectification_of(
         camera = stored_camera(result)
     elif scale.camera is not None:
         camera = CameraCalibration.read(scale.camera)
+    document = result.provenance.get(MESH_DOCUMENT)
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    elif (
-        (unit or stated.unit) == "mm"
-        and units.mm_per_pixel is None
-        and "camera" not in result.provenance
-        and (document := result.provenance.get(MESH_DOCUMENT)) is not None
-    ):
+    elif document is not None and units.mm_per_pixel is not None:
+        raise InputError(
+            f"scale.mm_per_pixel ({units.mm_per_pixel:g}) states a scale, the mesh of {result.path} has another, that "
+            "of mesh.file: leave it out"
+        )
+    elif document is not None and (unit or stated.unit) == "mm" and "camera" not in result.provenance:
         mm_per_pixel, std = load_extension(MESH_SOURCES, MESH_DOCUMENT, "the mesh of the result").scale(document)
         units = Units(mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
     return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), units, camera)
