@@ -395,7 +395,7 @@ def _red_and_blue(samples: PlaneSamples, crosstalk: Crosstalk) -> Iterator[Check
 def _interpolated(samples: PlaneSamples) -> Iterator[Check]:
     """Check for samples interpolated from a mosaic: smoother along one axis, or at some places of a 2 x 2 cell.
 
-    In a plane of a mosaic, interpolated by another phase of the pattern, samples are means of neighbours along one axis,
+    In a plane of a mosaic interpolated by another phase of the pattern samples are means of neighbours along one axis,
     which leaves nothing of the highest frequency there: of white noise, mean square sixth over mean square fourth
     differences are then 1.4 times as large along the other axis (derived). Over those of the planes beside it they
     depend on the axis 1.06 times in good scenes, 1.17 times at most under streaks of a reflection and in files of two
