@@ -369,7 +369,17 @@ def project_with_slopes(
 
 
 def lens_matrix(lens: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) of a lens (8,) as OpenCV has it, without its distortion."""
+    """Return the matrix of a lens as OpenCV has it, without its distortion.
+
+    Parameters
+    ----------
+    lens : ndarray, shape (8,)
+        See `rgbmidic.fields.plane.LENS_PARAMETERS`.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+    """
     return np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1.0]])
 
 
