@@ -53,14 +53,11 @@ def pose(angles: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
 
 def cameras() -> CameraPair:
     """Both cameras; their pixels count as square and not skewed, which moves a point by up to .06 px."""
-    (turn, shift), (other, there) = map(pose, POSES)
-    relative = other @ turn.T
     left, right = (
         CameraCalibration(shape=(1200, 1920), lens=np.array([(fx + fy) / 2, cx, cy, k1, k2, 0, 0, k3]))
         for cx, cy, fx, fy, _, k1, k2, k3 in (LEFT, RIGHT)
     )
-    rotation = np.ravel(cv2.Rodrigues(relative)[0])
-    return CameraPair(left=left, right=right, rotation=rotation, translation=there - relative @ shift)
+    return CameraPair.of_poses((left, right), *map(pose, POSES))
 
 
 def beyond_a_plane(values: FloatArray, x: FloatArray, y: FloatArray) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.fields.plane import CameraCalibration
-from rgbmidic.tools.stereo import CameraPair, triangulate
+from rgbmidic.tools.stereo import CameraPair, lens_matrix, project_with_slopes, triangulate
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.camera import LIMITS as CAMERA_LIMITS
 from rgbmidic_calibration.camera import CameraEstimate, estimate_lens
@@ -184,8 +184,8 @@ def estimate_stereo(pairs: Sequence[ViewPair], rejected: Sequence[str] = ()) -> 
         )
     if not fit.pair.baseline > 5 * np.sqrt(np.trace(fit.pair.covariance[19:, 19:])):
         raise CalibrationError(
-            f"both cameras stand at one place: their distance is {fit.pair.baseline:.2g} mm, which is nothing within "
-            "its uncertainty: are the photographs of one camera stated twice?"
+            f"both cameras stand at one place: their distance, {fit.pair.baseline:.2g} mm, is nothing within its "
+            "uncertainty: are the photographs of one camera stated twice?"
         )
     held_out = list(pairs[LIMITS.held_out - 1 :: LIMITS.held_out])
     if held_out and len(pairs) - len(held_out) >= LIMITS.min_fitted:
@@ -232,16 +232,12 @@ def _pose(view: View, camera: CameraCalibration) -> Pose:
     """Return the pose of the target in one view."""
     lens = camera.lens
     assert lens is not None
-    _, turn, shift = cv2.solvePnP(_in_space(view.points), view.pixels, _matrix(lens), lens[3:])
+    _, turn, shift = cv2.solvePnP(_in_space(view.points), view.pixels, lens_matrix(lens), lens[3:])
     return np.ravel(turn), np.ravel(shift)
 
 
 def _in_space(points: FloatArray) -> FloatArray:
     return np.pad(points, ((0, 0), (0, 1)))
-
-
-def _matrix(lens: FloatArray) -> FloatArray:
-    return np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1.0]])
 
 
 def _relative(left: Pose, right: Pose) -> Pose:
@@ -370,16 +366,16 @@ def _linearised(
         chain = np.block([[composed[2], composed[3]], [composed[6], composed[7]]])  # by the target's pose
         chain_pair = np.block([[composed[4], composed[5]], [composed[8], composed[9]]])  # by the relative pose
         for side, (seen, camera, pose) in enumerate(
-            ((view.left, pair.left, (turn, shift)), (view.right, pair.right, (composed[0], composed[1])))
+            (
+                (view.left, pair.left, (turn, shift)),
+                (view.right, pair.right, (np.ravel(composed[0]), np.ravel(composed[1]))),
+            )
         ):
             assert camera.lens is not None
-            lens, rows = camera.lens, slice(2 * side, 2 * side + 2)
-            points, slopes = cv2.projectPoints(_in_space(seen.points), *pose, _matrix(lens), lens[3:])[:2]
-            slopes = np.asarray(slopes).reshape(count, 2, -1)
-            residual[:, rows] = seen.pixels - points[:, 0]
-            by_lens = np.concatenate([slopes[..., 6:7] + slopes[..., 7:8], slopes[..., 8:15]], axis=2)
-            by_cameras[:, rows, 8 * side : 8 * side + 8] = by_lens
-            by_pose[:, rows] = slopes[..., :6] @ chain if side else slopes[..., :6]
+            rows, lens = slice(2 * side, 2 * side + 2), slice(8 * side, 8 * side + 8)
+            pixels, by_cameras[:, rows, lens], slopes = project_with_slopes(camera.lens, _in_space(seen.points), pose)
+            residual[:, rows] = seen.pixels - pixels
+            by_pose[:, rows] = slopes @ chain if side else slopes
             if side:
-                by_cameras[:, rows, 16:] = slopes[..., :6] @ chain_pair
+                by_cameras[:, rows, 16:] = slopes @ chain_pair
         yield residual, by_cameras, by_pose

@@ -54,11 +54,32 @@ class CalibrationErrors:
     gain: FloatArray
 
     def at_nodes(self, values: FloatArray) -> FloatArray:
-        """Return the errors (M, c, n) of displacements (c, n) of the nodes; NaN where these are."""
+        """Return the errors of displacements of the nodes.
+
+        Parameters
+        ----------
+        values : ndarray, shape (c, n)
+            Displacements; NaN where a node has no data.
+
+        Returns
+        -------
+        ndarray, shape (M, c, n)
+            NaN where the displacements are.
+        """
         return np.asarray(np.einsum("mijn,jn->min", self.gain, values))
 
     def subset(self, nodes: IntArray) -> Self:
-        """Return the errors of some nodes (m,) alone."""
+        """Return the errors of some nodes alone.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (m,), int
+            Their indices.
+
+        Returns
+        -------
+        CalibrationErrors
+        """
         return replace(self, surface=self.surface[..., nodes], gain=self.gain[..., nodes])
 
     def of_sums(self, weights: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,7 @@ material point in both; both displacements are triangulated frame by frame with 
 
 from rgbmidic.tools.stereo.axes import Axes
 from rgbmidic.tools.stereo.calibration_part import CalibrationPart
-from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair
+from rgbmidic.tools.stereo.camera_pair import PAIR_PARAMETERS, CameraPair, lens_matrix, project_with_slopes
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh, carry_mesh
 from rgbmidic.tools.stereo.left_result import LeftResult, open_left
 from rgbmidic.tools.stereo.result import StereoResult
@@ -31,8 +31,10 @@ __all__ = [
     "SurfaceStrain",
     "Triangulation",
     "carry_mesh",
+    "lens_matrix",
     "measure_stereo",
     "measure_stereo_part",
     "open_left",
+    "project_with_slopes",
     "triangulate",
 ]

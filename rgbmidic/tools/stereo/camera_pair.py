@@ -19,7 +19,7 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.fields.plane import LENS_PARAMETERS, distorted, undistorted
 from rgbmidic.illumination.calibration import has_schema, read_document, write_document
-from rgbmidic.typing import FloatArray, as_numbers
+from rgbmidic.typing import AnyArray, FloatArray, as_numbers
 
 _SCHEMA, _VERSION = "rgbmidic-stereo", 1
 _POSE = tuple(f"{name}_{axis}" for name in ("rotation", "translation") for axis in "xyz")
@@ -80,6 +80,30 @@ class CameraPair:
             )
         if not np.linalg.norm(self.rotation) <= np.pi:
             raise CalibrationError(f"{self.name}: the rotation is {np.linalg.norm(self.rotation):g} rad, at most pi")
+
+    @classmethod
+    def of_poses(
+        cls,
+        cameras: tuple[CameraCalibration, CameraCalibration],
+        left: tuple[FloatArray, FloatArray],
+        right: tuple[FloatArray, FloatArray],
+    ) -> Self:
+        """Relate two cameras by where each stands in the axes of a scene.
+
+        Parameters
+        ----------
+        cameras
+            Left and right camera.
+        left, right
+            Rotation (3, 3) and translation (3,), mm, from the scene's axes to either camera's.
+
+        Returns
+        -------
+        CameraPair
+        """
+        turn = right[0] @ left[0].T
+        rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64).ravel()
+        return cls(left=cameras[0], right=cameras[1], rotation=rotation, translation=right[1] - turn @ left[1])
 
     @property
     def cameras(self) -> tuple[CameraCalibration, CameraCalibration]:
@@ -162,20 +186,10 @@ class CameraPair:
         -------
         ndarray, shape (N, 4, 22)
         """
+        _, of_left, _ = project_with_slopes(self.parameters[:8], points, (np.zeros(3), np.zeros(3)))
+        _, of_right, of_pose = project_with_slopes(self.parameters[8:16], points, (self.rotation, self.translation))
         slopes = np.zeros((len(points), 4, _COUNT))
-        for side, (camera, pose) in enumerate(
-            zip(self.cameras, ((np.zeros(3), np.zeros(3)), (self.rotation, self.translation)), strict=True)
-        ):
-            lens = camera.lens
-            assert lens is not None
-            matrix = np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1.0]])
-            by_all = cv2.projectPoints(np.ascontiguousarray(points), *pose, matrix, lens[3:])[1]
-            by_all = np.asarray(by_all).reshape(len(points), 2, -1)
-            rows, first = slice(2 * side, 2 * side + 2), 8 * side
-            slopes[:, rows, first] = by_all[..., 6] + by_all[..., 7]
-            slopes[:, rows, first + 1 : first + 8] = by_all[..., 8:15]
-            if side:
-                slopes[:, rows, 16:] = by_all[..., :6]
+        slopes[:, :2, :8], slopes[:, 2:, 8:16], slopes[:, 2:, 16:] = of_left, of_right, of_pose
         return slopes
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -326,6 +340,47 @@ class CameraPair:
         return (
             f"focal lengths {focal} px, baseline {self.baseline:.3f} mm, {self.angle_deg:.2f} degrees between the axes"
         )
+
+
+def project_with_slopes(
+    lens: FloatArray, points: FloatArray, pose: tuple[AnyArray, AnyArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return where a lens images points (N, 3), px (N, 2), and the derivatives of that by lens and pose.
+
+    Parameters
+    ----------
+    lens : ndarray, shape (8,)
+        See `rgbmidic.fields.plane.LENS_PARAMETERS`.
+    points : ndarray, shape (N, 3)
+        mm.
+    pose
+        Rotation vector and translation from the axes of the points to those of the camera.
+
+    Returns
+    -------
+    pixels : ndarray, shape (N, 2)
+    by_lens : ndarray, shape (N, 2, 8)
+    by_pose : ndarray, shape (N, 2, 6)
+    """
+    pixels, slopes = cv2.projectPoints(np.ascontiguousarray(points), *pose, lens_matrix(lens), lens[3:])[:2]
+    slopes = np.asarray(slopes, dtype=np.float64).reshape(len(points), 2, -1)
+    by_lens = np.concatenate([slopes[..., 6:7] + slopes[..., 7:8], slopes[..., 8:15]], axis=2)
+    return np.asarray(pixels, dtype=np.float64)[:, 0], by_lens, slopes[..., :6]
+
+
+def lens_matrix(lens: FloatArray) -> FloatArray:
+    """Return the matrix of a lens as OpenCV has it, without its distortion.
+
+    Parameters
+    ----------
+    lens : ndarray, shape (8,)
+        See `rgbmidic.fields.plane.LENS_PARAMETERS`.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+    """
+    return np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1.0]])
 
 
 def image_plane(camera: CameraCalibration, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

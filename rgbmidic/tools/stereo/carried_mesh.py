@@ -46,7 +46,6 @@ class CarryConstants:
         half is hidden from the right camera is still one).
     max_depths
         Depths that are tried at most (chosen: a depth is a match, which takes as long as a frame).
-    max_depths: int = 12
     min_jump, min_turn
         Change of the second difference of the match from a node to the next where a step lies between them, over its
         standard uncertainty (in noise once in a million) and over the largest second difference around: steps of .3 to

@@ -104,15 +104,9 @@ class StereoResult:
 
     def __getitem__(self, name: str) -> AnyArray:
         """Read a quantity of `QUANTITIES`: (N, ...) of the shape, (T, N, ...) of frames; NaN where there is no data."""
-        import h5py
-
         if name not in QUANTITIES:
             raise InputError(f"a stereo result has no {name!r}; it has {', '.join(QUANTITIES)}")
-        try:
-            with h5py.File(self.path, "r") as content:
-                return np.asarray(content[name][...])
-        except (OSError, KeyError) as error:
-            raise ResultError(f"{self.path} is damaged: {error}") from None
+        return self._read([name], ...)[name]
 
     def frame(self, names: Iterable[str], index: int) -> dict[str, AnyArray]:
         """Read quantities of one frame.
@@ -135,10 +129,13 @@ class StereoResult:
         ResultError
             The file is damaged.
         """
-        import h5py
-
         if not 0 <= index < len(self):
             raise InputError(f"there is no frame {index} in a result of {len(self)} frames (0 to {len(self) - 1})")
+        return self._read(names, index)
+
+    def _read(self, names: Iterable[str], index: Any) -> dict[str, AnyArray]:
+        import h5py
+
         try:
             with h5py.File(self.path, "r") as content:
                 return {name: np.asarray(content[name][index]) for name in names}

@@ -194,6 +194,15 @@ def test_samples_interpolated_from_a_mosaic():
     assert found(sensors) == {}
 
 
+@pytest.mark.parametrize("width", [2.4, 4.0])
+def test_streaks_of_a_reflection_in_one_light_pass(width):
+    """Twice and more as fine along one axis as along the other: refused as interpolated by second differences."""
+    streaks = cv2.GaussianBlur(np.random.default_rng(0).normal(size=SHAPE), (0, 0), width, sigmaY=1.2)
+    images = lights(4.2)
+    images[0] += 1000 * np.maximum(streaks / streaks.std(), 0)
+    assert found(recorded(images)) == {}
+
+
 def test_what_is_accepted_is_told_and_what_is_unknown_refused():
     frame = recorded(lights(), change=red(1.2))
     with pytest.raises(FrameError, match=r"shot\.dng is not what was calibrated.*calibration\.accept = \[\"levels\"\]"):

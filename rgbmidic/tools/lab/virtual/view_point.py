@@ -158,13 +158,8 @@ def true_pair(scene: Scene, left: ViewPoint, right: ViewPoint) -> CameraPair:
         )
         for view in (left, right)
     )
-    turn = right.rotation @ left.rotation.T
-    return CameraPair(
-        left=first,
-        right=second,
-        rotation=np.ravel(cv2.Rodrigues(turn)[0]),
-        translation=right.translation - turn @ left.translation,
-    )
+    poses = ((view.rotation, view.translation) for view in (left, right))
+    return CameraPair.of_poses((first, second), *poses)
 
 
 def true_motion(scene: Scene, left: ViewPoint, pixels: FloatArray, state: State) -> tuple[FloatArray, FloatArray]:
