@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import signal
 import sys
@@ -39,6 +40,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
+    logging.getLogger().setLevel(logging.INFO)  # once: `log_level` sets it for every phase of every test
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # sources are compiled once, as kernels are, not by every process
     sys.dont_write_bytecode = False
     typer.main.get_command = cache(typer.main.get_command)  # 15 ms, of every command that a test executes
