@@ -163,6 +163,7 @@ def stretched(tmp_path: Path) -> tuple[Result, Path]:
     return result_of(tmp_path / "result", fields, ScaleSettings(camera=tmp_path / "camera.json")), tmp_path
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -> None:
     result, folder = stretched
     camera = CameraCalibration.read(folder / "camera.json")

@@ -120,7 +120,7 @@ def test_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(test_file: Path) -> Result:
     out = test_file.with_name("result")
-    assert execute(app, ["run", str(test_file), "--out", str(out)]) == 0
+    assert execute(app, ["run", str(test_file), "--out", str(out), "--no-figures"]) == 0
     return Result.open(out)
 
 
