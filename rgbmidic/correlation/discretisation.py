@@ -206,8 +206,7 @@ def _finer_field(
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
     """Right-hand side (2 N,) of a known difference of all lights (k, P)."""
-    lights = zip(weights, difference, reference.gradient.swapaxes(0, 1), strict=True)
-    return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
+    return reference.assembly.vector(reference.projected(weights, difference).sum(axis=0))
 
 
 def _precision_weights(
