@@ -205,7 +205,7 @@ def _finer_field(
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
     """Right-hand side (2 N,) of a known difference of all lights (k, P)."""
-    return reference.assembly.vector(reference.projected(weights, difference, reference.gradient).sum(axis=0))
+    return reference.assembly.vector(reference.projected(weights, difference).sum(axis=0))
 
 
 def _precision_weights(

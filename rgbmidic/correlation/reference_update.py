@@ -327,8 +327,8 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
     The sums are NaN where a node has no displacement.
     """
     residual, has_displacement = _residual(reference, deformed, displacement, rigid)
-    projected = reference.projected(residual.weights, residual.difference, reference.gradient)
-    return np.where(has_displacement[:, None], projected.sum(axis=(0, 2)), np.nan)
+    scores = reference.projected(residual.weights, residual.difference).sum(axis=(0, 2))
+    return np.where(has_displacement[:, None], scores, np.nan)
 
 
 def _residual(
