@@ -171,19 +171,20 @@ class ProfileLine:
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside "
                 f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
-        self.points, self.positions, self.unit = points, np.linspace(0, length, len(points)), "px"
+        self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.mesh_points = mesh_points.nearby()
-        self.coordinates = points if covariance.surface is None else mesh_points.read(covariance.surface)
+        self.coordinates, self.unit = points, "px"
         if covariance.surface is not None:
-            self.unit = "mm"
+            self.coordinates, self.unit = mesh_points.read(covariance.surface), "mm"
             steps_in_space = np.linalg.norm(np.diff(self.coordinates, axis=0), axis=1)
             outside = np.nanmedian(steps_in_space)  # the surface is not known there
             self.positions = np.append(0.0, np.cumsum(np.where(np.isfinite(steps_in_space), steps_in_space, outside)))
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
-        nodes = self.nodes
-        exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
-        strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
-        self.covariances = {"": covariance.subset(nodes), "exx": exx, "eyy": eyy, "strain": strain_covariance}
+        slopes = [slope[self.nodes] for slope in gauges.slopes]
+        self.covariances = {"": covariance.subset(self.nodes), "strain": covariance.relative(slopes)}
+        self.covariances |= {
+            name: covariance.relative([slope]) for name, slope in zip(("exx", "eyy"), slopes, strict=True)
+        }
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)

@@ -233,13 +233,8 @@ class ResultInUnits(Portable):
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
         return result.in_units(scale).with_times()
 
-    @classmethod
-    def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
-        """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
-        return cls(result=result, scale=scale, rectified=rectification_of(result, scale))
-
     def with_times(self) -> Self:
-        """Read the times of all frames."""
+        """Read the times of all frames, which single frames, and a result that still grows, do without."""
         return self._changed("units", "columns", timed=self.seconds is not None)
 
     def with_strain(self, gauge: float | None, measure: str) -> Self:
