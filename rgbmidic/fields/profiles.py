@@ -229,7 +229,10 @@ class ProfileLine:
         """
         weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool).tobytes()))
         errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
-        return _unit(errors @ errors.T)
+        covariance = errors @ errors.T
+        scale = np.sqrt(np.diag(covariance))
+        scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
+        return np.asarray(covariance * scale * scale[:, None])
 
 
 def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:
@@ -238,13 +241,6 @@ def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:
     weights = mesh_points.weights(has_data).toarray()
     weights[~mesh_points.measured(has_data)] = np.nan
     return np.asarray(weights)
-
-
-def _unit(covariance: FloatArray) -> FloatArray:
-    """Return the correlation of a covariance matrix; 0 where a variance is."""
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
-    return np.asarray(covariance * scale * scale[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
