@@ -229,8 +229,7 @@ class ProfileLine:
         """
         weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool).tobytes()))
         errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
-        covariance = errors @ errors.T
-        scale = np.sqrt(np.diag(covariance))
+        scale = np.sqrt(np.diag(covariance := errors @ errors.T))
         scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
         return np.asarray(covariance * scale * scale[:, None])
 
