@@ -101,12 +101,13 @@ def _stamped_times(result: Result) -> FloatArray:
 
     That of a frame that could not be measured, such as one that could not be read, follows from its number.
     """
-    stamps, number = result.time_ns[result.finished], result.number[result.finished].astype(np.float64)
+    finished = result.finished
+    stamps, number = result.time_ns[finished], result.number[finished].astype(np.float64)
     stamped = stamps != UNKNOWN_TIME
     seconds = np.where(stamped, stamps * 1e-9, np.nan)
     if stamped.sum() > 1:
         first, *_, last = number[stamped]
-        lost = ~stamped & (result.status[result.finished] == FAILED)
+        lost = ~stamped & (result.status[finished] == FAILED)
         interval = np.median(np.diff(seconds[stamped]) / np.maximum(np.diff(number[stamped]), 1))
         seconds[lost] = np.interp(number[lost], number[stamped], seconds[stamped])
         seconds[lost] += interval * (number[lost] - np.clip(number[lost], first, last))
