@@ -20,7 +20,6 @@ from rgbmidic.frames import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.tools.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -148,7 +147,7 @@ def rate(values: FloatArray, std: FloatArray, truth: FloatArray) -> FloatArray:
 
 def ratios(strip: Strip, result: Result) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Row, quantity, errors and errors over stated uncertainty of a result."""
-    physical = ResultInUnits.without_times(result)
+    physical = result.in_units()
     length, nodes = 3 * physical.mesh.size, result.nodes.astype(np.float64)
     truth = np.stack([[strip.displacement(nodes, i + step) for i in range(FRAMES)] for step in (-STEP, 0, STEP)])
     step = np.array([0.05, 0.0])

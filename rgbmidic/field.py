@@ -158,11 +158,6 @@ class Field:
         stacked = first.with_arrays(lambda *arrays: np.stack(arrays, axis=-2), *others)
         return replace(stacked, dims=(*first.dims[:-1], dim, first.dims[-1]))
 
-    @property
-    def is_doubtful(self) -> BoolArray:
-        """Mask of the values that lie within two standard uncertainties of 0."""
-        return np.asarray(np.abs(self.values) < 2 * self.uncertainty)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Displacement(Field):

@@ -171,19 +171,20 @@ class ProfileLine:
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside "
                 f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
-        self.points, self.positions, self.unit = points, np.linspace(0, length, len(points)), "px"
+        self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.mesh_points = mesh_points.nearby()
-        self.coordinates = points if covariance.surface is None else mesh_points.read(covariance.surface)
+        self.coordinates, self.unit = points, "px"
         if covariance.surface is not None:
-            self.unit = "mm"
+            self.coordinates, self.unit = mesh_points.read(covariance.surface), "mm"
             steps_in_space = np.linalg.norm(np.diff(self.coordinates, axis=0), axis=1)
             outside = np.nanmedian(steps_in_space)  # the surface is not known there
             self.positions = np.append(0.0, np.cumsum(np.where(np.isfinite(steps_in_space), steps_in_space, outside)))
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
-        nodes = self.nodes
-        exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
-        strain_covariance = covariance.relative([slope[nodes] for slope in gauges.slopes])
-        self.covariances = {"": covariance.subset(nodes), "exx": exx, "eyy": eyy, "strain": strain_covariance}
+        slopes = [slope[self.nodes] for slope in gauges.slopes]
+        self.covariances = {"": covariance.subset(self.nodes), "strain": covariance.relative(slopes)}
+        self.covariances |= {
+            name: covariance.relative([slope]) for name, slope in zip(("exx", "eyy"), slopes, strict=True)
+        }
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
@@ -233,7 +234,9 @@ class ProfileLine:
         """
         weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool).tobytes()))
         errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
-        return (1 - common_fraction) * _unit(errors @ errors.T) + common_fraction
+        scale = np.sqrt(np.diag(covariance := errors @ errors.T))
+        scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
+        return np.asarray((1 - common_fraction) * covariance * scale * scale[:, None] + common_fraction)
 
 
 def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:
@@ -242,13 +245,6 @@ def _weights(mesh_points: MeshPoints, measured: bytes) -> FloatArray:
     weights = mesh_points.weights(has_data).toarray()
     weights[~mesh_points.measured(has_data)] = np.nan
     return np.asarray(weights)
-
-
-def _unit(covariance: FloatArray) -> FloatArray:
-    """Return the correlation of a covariance matrix; 0 where a variance is."""
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
-    return np.asarray(covariance * scale * scale[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -357,9 +357,9 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         -------
         ResultInUnits
         """
-        from rgbmidic.results.result_in_units import ResultInUnits
+        from rgbmidic.results.result_in_units import ResultInUnits, rectification_of
 
-        return ResultInUnits.without_times(self, scale)
+        return ResultInUnits(result=self, scale=scale, rectified=rectification_of(self, scale))
 
     def to_xarray(self, scale: ScaleSettings | None = None) -> xr.Dataset:
         """Return the result with named dimensions, coordinates and units; values are read frame by frame when used.

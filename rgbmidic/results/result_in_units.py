@@ -101,12 +101,13 @@ def _stamped_times(result: Result) -> FloatArray:
 
     That of a frame that could not be measured, such as one that could not be read, follows from its number.
     """
-    stamps, number = result.time_ns[result.finished], result.number[result.finished].astype(np.float64)
+    finished = result.finished
+    stamps, number = result.time_ns[finished], result.number[finished].astype(np.float64)
     stamped = stamps != UNKNOWN_TIME
     seconds = np.where(stamped, stamps * 1e-9, np.nan)
     if stamped.sum() > 1:
         first, *_, last = number[stamped]
-        lost = ~stamped & (result.status[result.finished] == FAILED)
+        lost = ~stamped & (result.status[finished] == FAILED)
         interval = np.median(np.diff(seconds[stamped]) / np.maximum(np.diff(number[stamped]), 1))
         seconds[lost] = np.interp(number[lost], number[stamped], seconds[stamped])
         seconds[lost] += interval * (number[lost] - np.clip(number[lost], first, last))
@@ -233,13 +234,8 @@ class ResultInUnits(Portable):
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
         return result.in_units(scale).with_times()
 
-    @classmethod
-    def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
-        """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
-        return cls(result=result, scale=scale, rectified=rectification_of(result, scale))
-
     def with_times(self) -> Self:
-        """Read the times of all frames."""
+        """Read the times of all frames, which single frames, and a result that still grows, do without."""
         return self._changed("units", "columns", timed=self.seconds is not None)
 
     def with_strain(self, gauge: float | None, measure: str) -> Self:

@@ -19,7 +19,6 @@ from rgbmidic.fields import Displacement, NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
-from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings, read_test
 from rgbmidic.tools.finite_elements import placement_of
 from rgbmidic.typing import FloatArray
@@ -132,9 +131,9 @@ def test_a_test_is_measured_on_the_mesh_of_a_file(result: Result) -> None:
     placement = placement_of(result)
     assert placement is not None
     assert placement.to_px(result.node_mm) == pytest.approx(result.nodes)
-    assert ResultInUnits.without_times(result).units.mm_per_pixel == pytest.approx(0.1)
+    assert result.in_units().units.mm_per_pixel == pytest.approx(0.1)
     with pytest.raises(InputError, match=r"scale\.mm_per_pixel \(0\.2\) states a scale, the mesh of .* has another"):
-        ResultInUnits.without_times(result, ScaleSettings(mm_per_pixel=0.2))
+        result.in_units(ScaleSettings(mm_per_pixel=0.2))
 
 
 def test_every_output_has_the_numbers_and_the_mesh_s_own_coordinates(result: Result, tmp_path: Path) -> None:

@@ -168,12 +168,6 @@ def test_errors_of_rates_are_as_large_as_stated(exact: Result, noisy: list[Resul
     assert all(0.85 < ratio < 1.1 for ratio in ratios.values()), ratios
 
 
-def test_a_value_within_two_standard_uncertainties_of_zero_is_doubtful(noisy: list[Result]) -> None:
-    read = Maps.from_result(noisy[0]).read("eyy", 1)
-    np.testing.assert_array_equal(read.is_doubtful, np.abs(read.values) < 2 * read.std)
-    assert 0 < read.is_doubtful.sum() < NODES
-
-
 @pytest.mark.parametrize(
     ("act", "says"),
     [
