@@ -87,7 +87,8 @@ def read_pair(folder: Path) -> Pair:
         first, second, region=(0.8 * width, MARGIN, width - 1 - MARGIN, height - 1 - MARGIN), element_size=16,
         prefilter="none", initial=(0, 0),
     )  # fmt: skip
-    added = np.random.default_rng(0).normal(scale=float(found.residual[0]), size=first.shape)
+    noise = float(found.residual[0]) * first.mean()  # the residual is that over the local mean
+    added = np.random.default_rng(0).normal(scale=noise, size=first.shape)
     return Pair(reference=first, deformed=second, still=first + added)
 
 

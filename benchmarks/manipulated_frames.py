@@ -3,8 +3,8 @@
 Every good scene is recorded by the calibrated camera and by cameras that are not: another gain and crosstalk, channels
 swapped, gains per channel, gamma, an 8-bit table, interpolated samples, another phase of the pattern, another black
 level. What is done to *stored* samples leaves gaps in their histogram, what is done *inside* the camera, before it
-stores them, does not. A count is of scenes with an error (and a warning) by `rgbmidic.illumination.frame_check`; with
-the whole calibration, and with its crosstalk alone.
+stores them, does not. A count is of scenes with an error (and a warning) by `rgbmidic.tools.preparation.frame_check`;
+with the whole calibration, and with its crosstalk alone.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from colour_scenes import NOISE, A, sparkle, speckle
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import contradictions
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.tools.lab.virtual import plate_scene, render, sphere_scene
+from rgbmidic.tools.preparation.frame_check import contradictions
 from rgbmidic.tools.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 

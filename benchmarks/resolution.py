@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from rgbmidic.fields import at_pixels, field_rms
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import resolution
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.refinement import refine
-from rgbmidic.pipeline.resolution import SPECKLES, study_sizes
 from rgbmidic.settings import FrameSettings, MeshSettings, RegionSettings, TestSettings
+from rgbmidic.tools.preparation import element_size as resolution
+from rgbmidic.tools.preparation.element_size import SPECKLES, study_sizes
+from rgbmidic.tools.preparation.refinement import refine
 
 from .tables import Row, table
 
@@ -137,7 +137,7 @@ SCENES = (
 )
 """Features of 14 to 160 px, a square root beside a point, noise of 3 to 20 % of the contrast, one light, and three of
 which one reflects. No constant was chosen on them."""
-QUICK = (4, 6)
+QUICK = (4,)
 
 
 def judged(scene: Scene) -> Row:

@@ -89,9 +89,9 @@ def tip(quick: bool) -> Iterator[dict[str, object]]:
         found = stress_intensity(*mesh, nodal, TIP, radii, MATERIAL)
         fitted = stress_intensity(*mesh, nodal, TIP, radii, replace(MATERIAL, fit_tip=True))
         ratio, free = (
-            np.sqrt(np.mean(((one.factors - FACTORS) / one.factors_std) ** 2, axis=0)) for one in (found, fitted)
+            np.sqrt(np.mean(((one.factors.values - FACTORS) / one.factors.std) ** 2, axis=0)) for one in (found, fitted)
         )
-        std = found.factors_std.mean(axis=0)
+        std = found.factors.std.mean(axis=0)
         yield {
             "elements [px]": str(size),
             "K_I stated": float(std[0]),

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from rgbmidic.renamed import refuse_old_names
@@ -94,6 +95,22 @@ def convert_disk_errors(error_type: type[RgbmidicError], failure: str) -> Iterat
         yield
     except OSError as error:
         raise error_type(f"{failure}: {disk_reason(error)}") from None
+
+
+def damaged_file(path: Path, reason: object) -> FrameError:
+    """Return the error for a file that cannot be read whole."""
+    return FrameError(f"{path} is damaged or truncated: {reason}")
+
+
+@contextmanager
+def library_faults(path: Path, *allowed: type[Exception]) -> Iterator[None]:
+    """Turn what another library raises over a damaged file, in many kinds, into a FrameError; but for `allowed`."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, (RgbmidicError, *allowed)):
+            raise
+        raise damaged_file(path, first_line(error)) from None
 
 
 def import_optional(module: str, extra: str) -> Any:

@@ -7,7 +7,7 @@ test that needs it, however that is run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rgbmidic.errors import ConfigurationError
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rgbmidic.fields import Probe
+    from rgbmidic.frames import FrameFormat
     from rgbmidic.mesh import MeshSource
+    from rgbmidic.pipeline.engine import OpenWorkers
     from rgbmidic.results import Result
     from rgbmidic.weights.light_weights import PrepareWeights
 
@@ -25,6 +27,12 @@ LIGHT_WEIGHTS: dict[str, Callable[[], PrepareWeights]] = {}
 """Methods of weighting by the name of ``weights.method``."""
 MESH_SOURCES: dict[str, Callable[[], MeshSource]] = {}
 """Meshes of other origin, by the name under which a result keeps their document; ``mesh.file`` is "finite_elements"."""
+PREPARATIONS: dict[str, Callable[[], Callable[..., Any]]] = {}
+"""What looks at the frames of a test before it is measured, by the key of TEST.toml that it is for."""
+FRAME_FORMATS: dict[str, Callable[[], tuple[FrameFormat, ...]]] = {}
+"""Formats of frame files beside those of `rgbmidic.frames`, by the kind of their files."""
+WORKERS: dict[str, Callable[[], OpenWorkers]] = {}
+"""Workers beside the threads of the process, by the kind of their scheduler."""
 
 RESULTS: dict[str, Callable[[], Callable[[Path], Result]]] = {}
 """Functions that open results of tools, by the file that marks their folder."""

@@ -197,7 +197,8 @@ class Displacement(Field):
         u, v : array_like, shape (N,) or (T, N)
             Displacement in px; NaN where a node has no data.
         *std : array_like of the same shape
-            u_std and v_std, u_bias and v_bias; those that are not given are not known, or 0.
+            u_std and v_std, u_bias and v_bias; those that are not given, or NaN at a node with data, are not known,
+            or 0.
 
         Returns
         -------
@@ -206,6 +207,8 @@ class Displacement(Field):
         pairs = [np.stack(np.broadcast_arrays(*pair)).astype(np.float64) for pair in ((u, v), std[:2], std[2:]) if pair]
         values, total, bias = [*pairs, None, None][:3]
         assert values is not None
+        if bias is not None and total is not None:
+            bias = np.where(np.isnan(bias) & np.isfinite(total), 0.0, bias)
         return cls(dims=("component", *("frame", "node")[3 - values.ndim :]), values=values, std=total, bias=bias)
 
     @property

@@ -29,10 +29,9 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "rgbmidic.tools.finite_elements.simulation": {"place": "find_placement", "places_among": "label_indices"},
     "rgbmidic.tools.report": {"Movie": "FieldMovie"},
     "rgbmidic.frames": {"Movie": "MovieSource", "known_formats": "frame_formats"},
-    "rgbmidic.settings": {"regular": "require_regular_file", "plain": "to_plain"},
+    "rgbmidic.settings": {"regular": "rgbmidic.disk.require_regular_file", "plain": "to_plain"},
     "Deformed": {"pictures": "images_on_first_light", "partial": "nonuniform_weight_blocks"},
     "Reference": {"unfitted": "residual_leverage"},
-    "Residual": {"without": "subtract_curvature"},
     "Precision": {"bend": "loss_curvature"},
     "rgbmidic.fields": {"Places": "MeshPoints", "Nodal": "Displacement", "History": "Field"},
     "MeshPoints": {"parts": "subdivide", "where": "bounds_text"},
@@ -56,7 +55,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "IlluminationImages": {"placed": "with_origin"},
     "Inspection": {"hidden": "lacks_contrast", "unmeasured": "unmeasured_fraction"},
     "Result": {**_STRAIN, "strain": "nodal_strain", "strain_std": "nodal_strain_std", "each": "iterate"},
-    "FrameRecord": {**_STRAIN, "of": "from_values", "from_solution": "from_measurement"},
+    "FrameRecord": {**_STRAIN, "of": "from_values"},
     "Maps": {
         "of": "from_result",
         "all": "quantities",
@@ -85,7 +84,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "FieldMovie": {"chosen": "frame_indices", "stated": "stated_limits"},
     "Curve": {"timed": "has_times"},
 }
-"""New names by the old ones, of modules and classes."""
+"""New names by the old ones, of modules and classes; with its module where that is another one."""
 
 
 def refuse_old_names(module: str) -> Callable[[str], NoReturn]:
@@ -93,7 +92,8 @@ def refuse_old_names(module: str) -> Callable[[str], NoReturn]:
 
     def refuse(name: str) -> NoReturn:
         if new := _NAMES[module].get(name):
-            raise ImportError(f"{module}.{name} is now {module}.{new}")  # an AttributeError would lose its message
+            place = new if "." in new else f"{module}.{new}"
+            raise ImportError(f"{module}.{name} is now {place}")  # an AttributeError would lose its message
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
 
     return refuse

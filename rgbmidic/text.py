@@ -1,9 +1,11 @@
-"""Numbers and objects as text: value and standard uncertainty to the same place, and tables for notebooks."""
+"""Numbers and objects as text: value and standard uncertainty to the same place, times, and tables for notebooks."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from html import escape
+from itertools import pairwise
 
 _FIXED_POINT_DECIMALS = range(-3, 9)
 """Decimals of a number that is written without a power of ten: from whole thousands to the eighth decimal."""
@@ -64,6 +66,32 @@ def format_with_std(value: float, std: float, unit: str = "") -> str:
         return "-"
     has_std = math.isfinite(std) and std > 0
     return " ".join(filter(None, [format_value(value, std), f"± {format_value(std, std)}" if has_std else "", unit]))
+
+
+def format_times(times: Sequence[float], digits: int = 12) -> list[str]:
+    """Write times with so many digits, or as many as it takes to tell each from the next to a thousandth.
+
+    Parameters
+    ----------
+    times
+        In any unit.
+    digits
+        The fewest.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> format_times([0.001, 0.002]), format_times([1.7e9, 1.7e9 + 0.001])
+    (['0.001', '0.002'], ['1700000000', '1700000000.001'])
+    """
+    finite = sorted(time for time in times if math.isfinite(time))
+    interval = min((after - before for before, after in pairwise(finite) if after > before), default=0.0)
+    if interval:
+        digits = max(digits, min(math.ceil(math.log10(max(map(abs, finite)) / interval)) + 3, 17))
+    return [f"{time:.{digits}g}" for time in times]
 
 
 class HtmlRepr:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import signal
+import sys
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, nullcontext
+from functools import cache
 
 import pytest
 import real_files
+import typer.main
 from draws import JITTER, SAMPLERS, other_draws
 from hypothesis import HealthCheck, settings
 from kernels_of_tests import compiled_in_background
@@ -36,6 +40,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
+    logging.getLogger().setLevel(logging.INFO)  # once: `log_level` sets it for every phase of every test
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # sources are compiled once, as kernels are, not by every process
+    sys.dont_write_bytecode = False
+    typer.main.get_command = cache(typer.main.get_command)  # 15 ms, of every command that a test executes
     if getattr(config.option, "numprocesses", None):
         os.environ |= {name: os.environ.get(name, "1") for name in THREADS}
         if not config.option.collectonly:
@@ -102,10 +110,22 @@ def alarm() -> Iterator[None]:
 
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures and movies that nobody looks at are drawn with a third of the resolution."""
+    """Pictures and movies that nobody looks at are drawn with a third of the resolution, texts wherever they fall."""
     savefig, movie = Figure.savefig, report.FieldMovie
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
+
+    def coarse(figure: Figure, *to: object, **how: object) -> None:
+        figure.set_layout_engine("none")  # an engine draws every text several times
+        savefig(figure, *to, **how | {"dpi": 50})
+
+    monkeypatch.setattr(Figure, "savefig", coarse)
     monkeypatch.setattr(report, "FieldMovie", lambda **shown: movie(**shown | {"width": 480}))
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made and not drawn, in tests about what is written beside them."""
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda _, *to, **how: savefig(Figure((1, 1)), *to, **how))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -97,3 +97,16 @@ def predict(padded, index, taps, size, scale, scale_block, mean, mean_block, sha
         value = (filters * padded[i : i + size, j : j + size]).sum()
         out[n, i, j] = between(mean[n], i, j, mean_block) + between(scale[n], i, j, scale_block) * value
     return out
+
+
+def common_slopes(variance, covariance, energy, allowed, to_lights, to_pairs):
+    """Squares of the channels' slopes on the common texture, and their own variances relative to them."""
+    sparkle, least = np.zeros_like(variance), 1e-4 * variance.min(axis=0)
+    for _ in range(2):
+        leaked = np.tensordot(to_pairs, np.maximum(np.tensordot(to_lights, sparkle, axes=1), 0), axes=1)
+        rg, rb, gb = np.maximum((covariance - leaked) / energy[:, None, None], least)
+        square = np.minimum(np.stack([rg * rb / gb, rg * gb / rb, rb * gb / rg]), variance)
+        excess = variance / square
+        specific = excess - excess.min(axis=0) + np.maximum(excess.min(axis=0) - 1 - allowed, 0)
+        sparkle = specific * square
+    return square, specific

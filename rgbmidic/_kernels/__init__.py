@@ -1,4 +1,4 @@
-"""All numba code of the project: loops over arrays, no objects, no checks, no allocation in hot loops."""
+"""All numba code of the core: loops over arrays, no objects, no checks, no allocation in hot loops."""
 
 from pathlib import Path
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.owned_pixels import LANES, correct_element, largest_element
+from rgbmidic._kernels.owned_pixels import LANES, largest_element
 from rgbmidic._kernels.splines import PAD
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
@@ -143,22 +143,6 @@ def _element_differences(
                     g = _spline(coefficients, cell, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     out[light, target + i] = reference[light, i0 + i] - g
             slot, remaining, x = slot + n, remaining - n, x + np.float32(n)
-
-
-@compiled("elements", fastmath=FAST)
-def differences(
-    start, stop, coefficients, height, width, reference, runs, run_offsets, origin, elements, barycentric, displacement,
-    offsets, out,
-):  # fmt: skip
-    """Differences ``f - g(x + u)`` (k, P) of lights that move alike, as in `compare_states`."""
-    flat, lights = coefficients.ravel(), len(reference)
-    buffer = np.empty((lights, largest_element(offsets) + LANES), dtype=np.float32)
-    for e in range(start, stop):
-        begin, motion = np.uint64(offsets[e]), (runs, run_offsets, origin, elements, barycentric, displacement)
-        _element_differences(flat, height, width, reference, *motion, e, begin, buffer)
-        for light in range(lights):
-            for i in range(np.uint64(offsets[e + 1]) - begin):
-                out[light, begin + i] = buffer[light, i]
 
 
 @helper()
@@ -406,43 +390,17 @@ def element_vector(start, stop, weight, values, first, second, local_x, local_y,
     """
     for e in range(start, min(stop, offsets.size - 1)):
         for light in range(len(weight)):
-            fields = weight, values, np.uint64(0), first, second, local_x, local_y
-            _project(light, *fields, offsets, barycentric, e, out)
-
-
-@compiled("offsets", fastmath=FAST)
-def corrected_vector(
-    start, stop, weight, difference, first, second, reference, inverse_level, scales, side, offset, lines, run_offsets,
-    local_x, local_y, offsets, barycentric, out,
-):  # fmt: skip
-    """Do the same with a `difference` that is corrected as by `correct_brightness`, and stays as it is."""
-    corrected = np.empty((len(weight), largest_element(offsets) + LANES), dtype=np.float32)
-    brightness = reference, inverse_level, scales, side, offset
-    for e in range(start, min(stop, offsets.size - 1)):
-        begin = np.uint64(offsets[e])
-        for light in range(len(weight)):
-            correct_element(light, difference, *brightness, lines, run_offsets, e, begin, corrected)
-            fields = weight, corrected, begin, first, second, local_x, local_y
-            _project(light, *fields, offsets, barycentric, e, out)
-
-
-@helper(fastmath=FAST)
-def _project(light, weight, values, begin, first, second, local_x, local_y, offsets, barycentric, e, out):
-    """Project on the shape functions of element e; slot `begin` is the first of the `values` (k, n)."""
-    p = px = py = q = qx = qy = _ZERO
-    low, high = np.uint64(offsets[e]), np.uint64(offsets[e + 1])
-    at = low - begin
-    for n in range(high - low):
-        i = low + n
-        weighted = weight[light, i] * values[light, at + n]
-        a, b = weighted * first[light, i], weighted * second[light, i]
-        p += a
-        px += a * local_x[i]
-        py += a * local_y[i]
-        q += b
-        qx += b * local_x[i]
-        qy += b * local_y[i]
-    for a in range(3):
-        constant, along_x, along_y = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
-        out[light, e, a, 0] = constant * p + along_x * px + along_y * py
-        out[light, e, a, 1] = constant * q + along_x * qx + along_y * qy
+            p = px = py = q = qx = qy = _ZERO
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
+                weighted = weight[light, i] * values[light, i]
+                a, b = weighted * first[light, i], weighted * second[light, i]
+                p += a
+                px += a * local_x[i]
+                py += a * local_y[i]
+                q += b
+                qx += b * local_x[i]
+                qy += b * local_y[i]
+            for a in range(3):
+                constant, along_x, along_y = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
+                out[light, e, a, 0] = constant * p + along_x * px + along_y * py
+                out[light, e, a, 1] = constant * q + along_x * qx + along_y * qy

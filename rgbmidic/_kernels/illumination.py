@@ -1,8 +1,8 @@
 """From a Bayer mosaic to channels, and from channels to lights.
 
-The mosaic comes padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer phase; a
-sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the position
-of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
+`malvar` takes the mosaic padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer
+phase; a sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the
+position of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 """
 
 import numpy as np
@@ -75,3 +75,53 @@ def malvar(start, stop, padded, red_row, red_column, out):
             row_colour_out[j] = 0.125 * (5 * centre + 4 * across - across2 - diagonal + 0.5 * along2)
             green_out[j] = centre
             other_out[j] = 0.125 * (5 * centre + 4 * along - along2 - diagonal + 0.5 * across2)
+
+
+@compiled("values")
+def subtract_black(start, stop, samples, black, white, values, saturated):
+    """Write ``values = samples - black`` of a mosaic (H, W) as float32, and where the samples reach `white`.
+
+    `black` (2, W) float32 has the levels along even and along odd rows.
+    """
+    for i in range(start, stop):
+        line, level, target, marks = samples[i], black[i % 2], values[i], saturated[i]
+        for j in range(line.size):
+            target[j] = np.float32(line[j]) - level[j]
+            marks[j] = line[j] >= white
+
+
+@compiled("square", axis=1)
+def common_slopes(start, stop, variance, covariance, energy, allowed, to_lights, to_pairs, square, specific):
+    """One-factor analysis of three channels in each block, less what the lights' sparkle adds to their covariances.
+
+    `variance` (3, h, w) of the channels; `covariance` (3, h, w) of red green, red blue, green blue, to be divided by
+    `energy` (3,), and before that freed of ``to_pairs @ max(to_lights @ sparkle, 0)``; to_lights: (k, 3), to_pairs:
+    (3, k). `allowed` is what all channels may have of their own. `square` (3, h, w) receives the squares of the slopes,
+    `specific` the channels' own variances relative to them.
+    """
+    lights, sparkle, leaked = len(to_lights), np.empty(3), np.empty(3)
+    for i in range(start, stop):
+        for j in range(square.shape[2]):
+            least = 1e-4 * min(variance[0, i, j], variance[1, i, j], variance[2, i, j])
+            sparkle[:] = 0.0
+            for _ in range(2):  # the correction is small and settles at once
+                leaked[:] = 0.0
+                for light in range(lights):
+                    a, b, c = to_lights[light]
+                    seen = max(a * sparkle[0] + b * sparkle[1] + c * sparkle[2], 0.0)
+                    for pair in range(3):
+                        leaked[pair] += to_pairs[pair, light] * seen
+                red_green = max((covariance[0, i, j] - leaked[0]) / energy[0], least)
+                red_blue = max((covariance[1, i, j] - leaked[1]) / energy[1], least)
+                green_blue = max((covariance[2, i, j] - leaked[2]) / energy[2], least)
+                square[0, i, j] = min(red_green * red_blue / green_blue, variance[0, i, j])
+                square[1, i, j] = min(red_green * green_blue / red_blue, variance[1, i, j])
+                square[2, i, j] = min(red_blue * green_blue / red_green, variance[2, i, j])
+                excess = np.inf
+                for c in range(3):
+                    specific[c, i, j] = variance[c, i, j] / square[c, i, j]
+                    excess = min(excess, specific[c, i, j])
+                # at least one channel is free of reflections at each place, unless it shows too much of its own
+                for c in range(3):
+                    specific[c, i, j] += max(excess - 1.0 - allowed, 0.0) - excess
+                    sparkle[c] = specific[c, i, j] * square[c, i, j]

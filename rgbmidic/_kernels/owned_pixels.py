@@ -60,28 +60,6 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
                 out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
 
 
-@compiled("polynomials", fastmath=FAST)
-def subtract_quadratic(
-    start, stop, difference, gradient_x, gradient_y, polynomials, local_x, local_y, offsets, out,
-):  # fmt: skip
-    """Take the effect of a displacement d, quadratic in every element, out of a residual.
-
-    ``out`` (k, P) receives ``difference - grad f . d``, all (k, P) float32. `polynomials` (E, 2, 6) float32 holds the
-    coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
-    """
-    for light in range(len(difference)):
-        residual, gx, gy, corrected = difference[light], gradient_x[light], gradient_y[light], out[light]
-        for e in range(start, stop):
-            u, v = polynomials[e, 0], polynomials[e, 1]
-            u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
-            v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
-            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-                x, y = local_x[i], local_y[i]
-                dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
-                dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
-                corrected[i] = residual[i] - gx[i] * dx - gy[i] * dy
-
-
 @compiled("factors", fastmath=FAST)
 def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top, left, out):
     """Add second derivatives of images (k, H, W) float32, times `factors` (E, 3) for xx, xy and yy, to ``out`` (k, P).
@@ -204,7 +182,12 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
     products = np.empty((len(out), largest), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        n = 0
+        n, total = 0, _ZERO
+        for a in range(len(values)):
+            for i in range(number):
+                total += weights[a, first + i]
+        if total == _ZERO:
+            continue
         for a in range(len(values)):
             for i in range(number):
                 root[a, i] = np.sqrt(weights[a, first + i])
@@ -217,62 +200,90 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
         _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
-@compiled("out", axis=1, fastmath=FAST)
+@compiled("out", axis=2, fastmath=FAST)
 def score_sums(
-    start, stop, residual, weights, gradient_x, gradient_y, values, inverse_level, lines, run_offsets, offsets, side,
-    out,
+    start, stop, residual, weights, gradient_x, gradient_y, images_x, images_y, values, inverse_level, polynomials,
+    local_x, local_y, lines, run_offsets, offsets, side, out, common,
 ):  # fmt: skip
-    """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
+    """Sum ``w r gx``, ``w r gy``, ``w (gx gx + gy gy)`` and the pixels with weight over blocks of `side` px.
 
-    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight. One of (6, h, w)
-    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` times the
+    ``out`` (k, 4, h, w) receives them of each light, whose fields are (k, P). `common` (4, h, w) receives sums over the
+    lights; it is (0, h, w) where they are not asked for: ``w r gx`` and ``w r gy`` with the gradient of the images, and
+    ``w (gx df/dx + gy df/dy)``, by differences from every other row of each element, for f the `values` times the
     `inverse_level` and for those less the residual.
+
+    The residual r is that given less the effect ``gx dx + gy dy`` of a displacement d that is quadratic in every
+    element: `polynomials` (E, 2, 6) float32 holds its coefficients of 1, x, y, x^2, x y, y^2 of the local position, px;
+    it is (0, 2, 6) without.
     """
-    out[:, start:stop] = 0
-    columns = np.zeros((len(out), out.shape[2] * side + LANES), dtype=np.float32)
-    size = largest_element(offsets) + LANES
-    # an array of its own: of a slice the compiler does not know that it is contiguous
-    scores, states = np.empty((len(out), size), dtype=np.float32), np.empty((4, size), dtype=np.float32)
-    inside, one = np.empty(largest_element(offsets), dtype=np.float32), np.uint64(1)
+    out[:, :, start:stop] = 0
+    common[:, start:stop] = 0
+    columns = np.zeros((4, out.shape[3] * side + LANES), dtype=np.float32)
+    largest, lights, one = largest_element(offsets) + LANES, len(weights), np.uint64(1)
+    scores, sums = np.empty((4, largest), dtype=np.float32), np.empty((4, largest), dtype=np.float32)
+    # arrays of their own: of a slice the compiler does not know that it is contiguous
+    half_x, half_y = np.empty((lights, largest), dtype=np.float32), np.empty((lights, largest), dtype=np.float32)
+    f, g = np.empty((lights, largest), dtype=np.float32), np.empty((lights, largest), dtype=np.float32)
+    r, dx, dy = np.empty(largest, dtype=np.float32), np.empty(largest, np.float32), np.empty(largest, np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        scores[:] = 0
-        if len(out) > 4:
-            inside[:number] = _ONE
-            for q in range(run_offsets[e], run_offsets[e + 1]):
-                if number > 0:
-                    inside[np.uint64(lines[q, 0] + lines[q, 1] - 1) - first] = _ZERO
-        for light in range(len(weights)):
+        if number == 0:
+            continue
+        sums[:] = _ZERO
+        dx[:], dy[:] = _ZERO, _ZERO
+        if len(polynomials) > 0:
+            _evaluate(polynomials[e, 0], local_x, local_y, first, number, dx)
+            _evaluate(polynomials[e, 1], local_x, local_y, first, number, dy)
+        for light in range(lights):
             for i in range(number):
                 w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]
-                weighted = w * residual[light, first + i]
-                scores[0, i] += weighted * gx
-                scores[1, i] += weighted * gy
-                scores[2, i] += w * (gx * gx + gy * gy)
-                scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
-            if len(out) == 4 or number == 0:
+                r[i] = residual[light, first + i] - gx * dx[i] - gy * dy[i]
+                weighted = w * r[i]
+                scores[0, i] = weighted * gx
+                scores[1, i] = weighted * gy
+                scores[2, i] = w * (gx * gx + gy * gy)
+                scores[3, i] = _ONE if w > _ZERO else _ZERO
+            _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out[light])
+            if len(common) == 0:
                 continue
             for i in range(number):
-                w = _HALF * weights[light, first + i]
-                states[0, i], states[1, i] = w * gradient_x[light, first + i], w * gradient_y[light, first + i]
-                states[2, i] = values[light, first + i] * inverse_level[light, first + i]
-                states[3, i] = states[2, i] - residual[light, first + i]
-            for i in range(number - one):
-                mean = inside[i] * (states[0, i] + states[0, i + one])
-                scores[4, i] += mean * (states[2, i + one] - states[2, i])
-                scores[5, i] += mean * (states[3, i + one] - states[3, i])
-            for q in range(run_offsets[e], run_offsets[e + 1] - 1):
-                if lines[q + 1, 2] != lines[q, 2] + 1:
-                    continue
-                low = max(lines[q, 3], lines[q + 1, 3])
-                count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
-                a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
-                b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+                w = weights[light, first + i]
+                sums[0, i] += w * r[i] * images_x[light, first + i]
+                sums[1, i] += w * r[i] * images_y[light, first + i]
+                half_x[light, i] = _HALF * w * gradient_x[light, first + i]
+                half_y[light, i] = _HALF * w * gradient_y[light, first + i]
+                f[light, i] = values[light, first + i] * inverse_level[light, first + i]
+                g[light, i] = f[light, i] - r[i]
+        if len(common) == 0:
+            continue
+        for q in range(run_offsets[e], run_offsets[e + 1], 2):
+            a, length = np.uint64(lines[q, 0]) - first, np.uint64(lines[q, 1] - 1)
+            for light in range(lights):
+                for i in range(a, a + length):
+                    mean = half_x[light, i] + half_x[light, i + one]
+                    sums[2, i] += mean * (f[light, i + one] - f[light, i])
+                    sums[3, i] += mean * (g[light, i + one] - g[light, i])
+            if q + 1 == run_offsets[e + 1] or lines[q + 1, 2] != lines[q, 2] + 1:
+                continue
+            low = max(lines[q, 3], lines[q + 1, 3])
+            count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
+            a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
+            b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+            for light in range(lights):
                 for i in range(np.uint32(max(count, 0))):
-                    mean = states[1, a + i] + states[1, b + i]
-                    scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
-                    scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
-        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+                    mean = half_y[light, a + i] + half_y[light, b + i]
+                    sums[2, a + i] += mean * (f[light, b + i] - f[light, a + i])
+                    sums[3, a + i] += mean * (g[light, b + i] - g[light, a + i])
+        _add(sums, first, lines, run_offsets, e, start * side, stop * side, side, columns, common)
+
+
+@helper(fastmath=FAST)
+def _evaluate(polynomial, local_x, local_y, first, number, out):
+    """Evaluate a polynomial, coefficients of 1, x, y, x^2, x y and y^2, at the pixels of an element."""
+    c0, c1, c2, c3, c4, c5 = (polynomial[0], polynomial[1], polynomial[2], polynomial[3], polynomial[4], polynomial[5])
+    for i in range(number):
+        x, y = local_x[first + i], local_y[first + i]
+        out[i] = c0 + x * (c1 + c3 * x + c4 * y) + y * (c2 + c5 * y)
 
 
 @helper()

@@ -159,8 +159,8 @@ def frames(
     from json import dumps
 
     from rgbmidic.frames import frame_formats
-    from rgbmidic.frames.series import describe, description_text, save_frame
     from rgbmidic.settings import FrameSettings
+    from rgbmidic.tools.lab.inspection.frame_files import describe, description_text, save_frame
 
     if formats:
         for format_ in frame_formats():
@@ -243,10 +243,10 @@ def resolution(
     overwrite: Overwrite = False,
 ) -> None:
     """Find the element size of a test: noise, discretisation error and strain resolution of several, on its frames."""
-    from rgbmidic.pipeline.resolution import study_sizes
     from rgbmidic.settings import read_test
     from rgbmidic.tools.lab import check_folder
     from rgbmidic.tools.lab import resolution as report
+    from rgbmidic.tools.preparation.element_size import study_sizes
 
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)

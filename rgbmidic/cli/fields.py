@@ -93,8 +93,8 @@ def history(
 
     Positions are in px on the reference; an option of a position may be given several times.
     """
+    from rgbmidic.disk import check_file
     from rgbmidic.results import history_rows, write_histories
-    from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
     from rgbmidic.settings import ChannelSettings, ProbeSettings
     from rgbmidic.tools.report import history_figure, save_figure
@@ -138,8 +138,8 @@ def profile(
     overwrite: command.Overwrite = False,
 ) -> None:
     """Read a field along a line in every frame: table, position-time picture, curves, speed of a front or peak."""
+    from rgbmidic.disk import check_file
     from rgbmidic.results import read_profile, write_profile
-    from rgbmidic.results.files import check_file
     from rgbmidic.results.profiles import arrivals_file
     from rgbmidic.tools.report import profile_figure, save_figure, wave_text
 

@@ -82,8 +82,8 @@ def batch(
     A test that fails does not stop the others; a finished test is not measured again. --overwrite replaces a
     result that was measured with other settings.
     """
-    from rgbmidic.pipeline import batch as series
-    from rgbmidic.results.files import write_errors
+    from rgbmidic.disk import write_errors
+    from rgbmidic.tools import batch as series
     from rgbmidic.tools.report import REPORT, write_batch_page, write_report
 
     if table is not None and len(tests) != 1:

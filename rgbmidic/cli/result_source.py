@@ -26,10 +26,8 @@ class ResultSource:
 
     def scale(self, *, px: bool = False) -> ScaleSettings | None:
         """Return the scale of these settings, with lengths in px if `px`; None: that of the result."""
-        from rgbmidic.settings import ScaleSettings
-
         scale = None if self.settings is None else self.settings.scale
-        return replace(scale or self.result.section(ScaleSettings), unit="px") if px else scale
+        return replace(scale or self.result.scale, unit="px") if px else scale
 
     def maps(self, derived: Mapping[str, Any]) -> Maps:
         """Return the fields of the result, derived as the options of `derived_options` state."""

@@ -248,13 +248,6 @@ class RigidMotions:
         return np.asarray(self.inverse @ (rigid_side - self.coupling.T @ free + self.response.T @ held_side))
 
 
-def block_side(pixels: PixelMap, element: float, constants: SolverConstants) -> int:
-    """Side (px) of the blocks for elements of side `element` (px); a small region has a few of them across."""
-    # of two of 19 px across the uncertainty was 1.8 times what it is
-    longest = min(round(constants.block_side_per_element * element), min(pixels.bounds[2:]) // 4)
-    return max(constants.min_block_side, longest)
-
-
 _MIN_RESIDUAL_LEVERAGE = 0.05
 """Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px leave
 .1)."""
@@ -293,7 +286,7 @@ def mean_residual_leverage(
     constants
         Of the solve.
     """
-    side = block_side(pixels, mesh.size, constants)
+    side = constants.merged_block_side(mesh.size, pixels.bounds[2:])
     rows, columns = pixels.grid(side)
     # of 700 blocks the random signs keep the projections apart to half a per cent of the fraction (derived)
     stride = int(np.clip(np.ceil(2 * np.sqrt(700 / (rows * columns))), 2, 4))

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.owned_pixels import score_sums
-from rgbmidic.correlation.assembly import block_side
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh.pixel_map import window_means
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockTable:
-    """Sums over blocks, for each light or for all together.
+    """Sums over blocks, of each light or of all together.
 
     Attributes
     ----------
-    sums : ndarray, shape (k, 6, h, w)
-        Scores ``w r h`` in x and y, their information ``w |h|^2`` in both, and the number of pixels with
-        weight; then ``w h . grad`` of the grey levels of the reference and of the deformed image, but for a gradient
-        that is not the solve's.
+    sums : ndarray, shape (k, 4, h, w)
+        Scores ``w r h`` in x and y, their information ``w |h|^2`` in both, and the number of pixels with weight.
+    common : ndarray, shape (4, h, w)
+        Sums over the lights: scores in x and y with the gradient of each light's own image, and ``w h . grad`` of the
+        grey levels of the reference and of the deformed image. (0, h, w) for a gradient that is not the solve's.
     side : int
         Of the blocks, px.
     reference
@@ -40,33 +41,71 @@ class BlockTable:
     """
 
     sums: FloatArray
+    common: FloatArray
     side: int
     reference: Reference
 
     @classmethod
     def of(
-        cls, residual: Residual, weights: FloatImage, *, gradient: FloatImage | None = None, wide: bool = False
+        cls,
+        residual: Residual,
+        weights: FloatImage,
+        *,
+        gradient: FloatImage | None = None,
+        deviation: FloatImage | None = None,
     ) -> BlockTable:
-        """Sum each light for itself, with the weights (k, P) of a solve and a `gradient` (2, k, P) that it is not.
+        """Sum each light for itself.
 
-        Wide blocks grow with the elements: what these cannot follow is alike over them.
+        Parameters
+        ----------
+        residual
+            The comparison.
+        weights : ndarray, shape (k, P), float32
+            Of the solve.
+        gradient : ndarray, shape (2, k, P), float32, optional
+            With which scores are made; None: that of the solve.
+        deviation : ndarray, shape (E, 2, 6), float32, optional
+            What the field has beyond the solution (`curved_deviation`), whose effect is no part of the residual.
         """
-        reference, pixels, constants = residual.reference, residual.reference.pixels, residual.reference.constants
-        side = block_side(pixels, reference.mesh.size, constants) if wide else constants.min_block_side
-        sums = np.empty((len(weights), 6 if gradient is None else 4, *pixels.grid(side)), dtype=np.float32)
-        columns = residual.difference, weights, *(reference.gradient if gradient is None else gradient)
-        # the last two sums need the grey levels of the reference, and one over their local mean
-        columns += (reference.values, reference.inverse_level) if gradient is None else columns[:2]
-        for light, out in enumerate(sums):
-            fields = (column[light : light + 1] for column in columns)
-            score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
-        return cls(sums=sums.astype(np.float64), side=side, reference=reference)
+        reference, pixels = residual.reference, residual.reference.pixels
+        side = reference.constants.score_block_side
+        grid = pixels.grid(side)
+        sums = np.empty((len(weights), 4, *grid), dtype=np.float32)
+        common = np.empty((4 if gradient is None else 0, *grid), dtype=np.float32)
+        gradients = (reference.gradient, reference.texture.images) if gradient is None else (gradient, gradient)
+        # where the last sums are asked for they need the grey levels of the reference, and one over their local mean
+        levels = (reference.values, reference.inverse_level) if gradient is None else (weights, weights)
+        polynomials = np.empty((0, 2, 6), dtype=np.float32) if deviation is None else deviation
+        fields = residual.difference, weights, *gradients[0], *gradients[1], *levels
+        geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+        score_sums(*fields, polynomials, *geometry, side, sums, common)
+        return cls(sums=sums.astype(np.float64), common=common.astype(np.float64), side=side, reference=reference)
+
+    def over_elements(self) -> BlockTable:
+        """Merge blocks where elements are larger: what these cannot follow is alike over them."""
+        reference = self.reference
+        side = reference.constants.merged_block_side(reference.mesh.size, reference.pixels.bounds[2:])
+        sums, common = (_merged(grids, side // self.side) for grids in (self.sums, self.common))
+        return replace(self, sums=sums, common=common, side=side)
 
     def together(self) -> BlockTable:
         """Return the table of all lights as one, whose pixels are those of the light that shows most of a block."""
         sums = self.sums.sum(axis=0)
         sums[3] = self.sums[:, 3].max(axis=0)
         return replace(self, sums=sums[None])
+
+    def with_common_scores(self) -> BlockTable:
+        """Put back what the fit has taken of the scores that the lights have in common, by their information of it."""
+        reference = self.reference
+        lost = 1 / np.sqrt(reference.residual_leverage) - 1
+        if np.ndim(lost):  # of the element nearest to each block
+            rows, columns = (np.indices(self.sums.shape[2:]) + 0.5) * self.side
+            centres = np.stack([columns, rows], axis=-1) + reference.pixels.bounds[1::-1]
+            lost = np.asarray(lost)[cKDTree(reference.mesh.centres).query(centres)[1]]
+        information, sums = self.sums[:, 2], self.sums.copy()
+        fraction = information / np.maximum(information.sum(axis=0), 1e-30)
+        sums[:, :2] += (lost * fraction)[:, None] * self.sums[:, :2].sum(axis=0)
+        return replace(self, sums=sums)
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:
         """Interpolate grids (n, h, w) at points (M, 2) in px, (n, M)."""
@@ -132,19 +171,22 @@ class BlockTable:
         Where glare or paint has changed since, the deformed image shows less of it. 1 where there is no texture.
         """
         smoothing = self.reference.constants.information_smoothing
-        reference, deformed = self.at(np.stack([window_means(grid, smoothing) for grid in self.sums[0, 4:]]), points)
+        reference, deformed = self.at(window_means(self.common[2:], smoothing), points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
     def windowed_means(self, grids: AnyArray) -> AnyArray:
         """Means of grids (..., h, w) over the window in which scores are averaged."""
         return window_means(grids, self.reference.constants.score_range / self.side)
 
-    def typical_ratio(self, scores: FloatArray) -> float:
-        """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
-        numerator, denominator = (
-            _typical_squares(self._relative(values[None]), self.sums[:, 3])[0] for values in (scores, self.sums[0, :2])
+    def disagreement_by_chance(self) -> float:
+        """Typical square of the scores that the gradients of the lights' own images add, over that of all scores."""
+        table = self.together()
+        total = table.sums[0, :2]
+        square, alone = (
+            _typical_squares(table._relative(scores[None]), table.sums[:, 3])[0]
+            for scores in (total, self.common[:2] - total)
         )
-        return float(numerator / denominator) if denominator > 0 else 0.0
+        return float(alone / square) if square > 0 else 0.0
 
     def _relative(self, scores: FloatArray) -> FloatArray:
         """Scores (k, 2, h, w) over the root of the information around them.
@@ -159,6 +201,13 @@ class BlockTable:
         level = information / np.maximum(pixels, 1e-6)
         usable = ((level > 0) & (counts > 0))[:, None]
         return np.asarray(np.divide(scores, np.sqrt(level)[:, None], out=np.zeros_like(scores), where=usable))
+
+
+def _merged(grids: FloatArray, number: int) -> FloatArray:
+    """Sum grids (..., h, w) over squares of `number` blocks a side; those at the end may hold fewer."""
+    for axis in (-2, -1):
+        grids = np.add.reduceat(grids, np.arange(0, grids.shape[axis], number), axis=axis) if number > 1 else grids
+    return grids
 
 
 def _typical_squares(scores: FloatArray, counts: FloatArray) -> FloatArray:

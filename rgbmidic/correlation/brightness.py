@@ -114,59 +114,48 @@ def _moments(sums: AnyArray, sigma: float, order: int) -> AnyArray:
     return out
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Brightness:
-    """Brightness of the deformed images of a pass.
+def inverse_gains(
+    difference: FloatImage,
+    gain: FloatArray,
+    offset: FloatArray,
+    fit: GainFit | None,
+    shape: tuple[int, int],
+    min_ratio: float,
+) -> tuple[FloatImage, int]:
+    """Return 1 / a of the lights from their differences f - g (k, P), for `correct_brightness`.
 
-    Attributes
-    ----------
-    gain : ndarray, shape (k,)
-        Of each light; NaN where it shows nothing.
-    offset : ndarray, shape (k, 3)
-        Of each light: its constant, and its slopes along the columns and rows of the rectangle around the pixels.
-    fit : GainFit or None
-        Of the local gains; None where the gain is one number.
+    The local gain is that of these very grey levels, so that a displacement leaves no gain behind. It is at least
+    `min_ratio` of the light's `gain` (k,); a light that shows nothing, whose gain is NaN, has 1.
+
+    Returns
+    -------
+    inverse_gains : ndarray, shape (k, h + 2, W), float32
+        In rows of blocks that cover the rectangle of `shape` around the pixels, and one more all around.
+    side : int
+        Of the blocks, px.
     """
-
-    gain: FloatArray
-    offset: FloatArray
-    fit: GainFit | None
-
-    def inverse_gains(self, difference: FloatImage, shape: tuple[int, int], min_ratio: float) -> tuple[FloatImage, int]:
-        """Return 1 / a of the lights from their differences f - g (k, P), for `correct_brightness`.
-
-        The local gain is that of these very grey levels, so that a displacement leaves no gain behind. It is at least
-        `min_ratio` of the light's gain; a light that shows nothing has 1.
-
-        Returns
-        -------
-        inverse_gains : ndarray, shape (k, h + 2, W), float32
-            In rows of blocks that cover the rectangle of `shape` around the pixels, and one more all around.
-        side : int
-            Of the blocks, px.
-        """
-        one = np.float32(1)
-        gain = np.nan_to_num(self.gain, nan=1.0)[:, None, None].astype(np.float32)
-        if self.fit is None:
-            side, grids = max(shape), 1 / gain
-        else:
-            side, (_, height, width) = self.fit.side, self.fit.sums.shape
-            rows, columns = np.ogrid[:height, :width]
-            x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
-            constant, along_x, along_y = self.offset.T[:, :, None, None]
-            plane = (constant + along_x * x + along_y * y).astype(np.float32)
-            local = self.fit.gains(self.fit.sums - self.fit.block_sums(difference) - plane * self.fit.totals)
-            grids = np.where(np.isfinite(self.gain[:, None, None]), 1 / np.maximum(local, min_ratio * gain), one)
-        margin = (0, 0), (1, 1), (1, 1)
-        if min(grids.shape[1:]) > 1:  # linear beyond the centres of the outermost blocks, too
-            grids = np.pad(grids, margin, mode="reflect", reflect_type="odd")
-            grids = np.clip(grids, 0, 1 / (min_ratio * gain))
-        else:
-            grids = np.pad(grids, margin, mode="edge")
-        out = np.empty((*grids.shape[:2], grids.shape[2] * side), dtype=np.float32)
-        for grid, image in zip(grids, out, strict=True):
-            cv2.resize(grid, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR)
-        return out, side
+    one = np.float32(1)
+    typical = np.nan_to_num(gain, nan=1.0)[:, None, None].astype(np.float32)
+    if fit is None:
+        side, grids = max(shape), 1 / typical
+    else:
+        side, (_, height, width) = fit.side, fit.sums.shape
+        rows, columns = np.ogrid[:height, :width]
+        x, y = (columns + 0.5) * side - 0.5, (rows + 0.5) * side - 0.5
+        constant, along_x, along_y = offset.T[:, :, None, None]
+        plane = (constant + along_x * x + along_y * y).astype(np.float32)
+        local = fit.gains(fit.sums - fit.block_sums(difference) - plane * fit.totals)
+        grids = np.where(np.isfinite(gain[:, None, None]), 1 / np.maximum(local, min_ratio * typical), one)
+    margin = (0, 0), (1, 1), (1, 1)
+    if min(grids.shape[1:]) > 1:  # linear beyond the centres of the outermost blocks, too
+        grids = np.pad(grids, margin, mode="reflect", reflect_type="odd")
+        grids = np.clip(grids, 0, 1 / (min_ratio * typical))
+    else:
+        grids = np.pad(grids, margin, mode="edge")
+    out = np.empty((*grids.shape[:2], grids.shape[2] * side), dtype=np.float32)
+    for grid, image in zip(grids, out, strict=True):
+        cv2.resize(grid, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR)
+    return out, side
 
 
 ELEMENTS = 300
@@ -194,46 +183,47 @@ def gain_and_offset(moments: FloatArray, centres: FloatArray, min_correlation: f
     fg, ff, gg = centred_products(moments)
     offsets[:, 0] = (g.sum(axis=1) - f.sum(axis=1)) / np.maximum(total.sum(axis=1), 1e-30)
     is_correlated = (ff > 0) & (gg > 0) & (fg > min_correlation * np.sqrt(ff * gg))
+    samples, levels = {}, {}
     for light, candidates in enumerate(is_correlated):
         if candidates.sum() > 0.1 * (ff[light] > 0).sum():
-            sample = np.flatnonzero(candidates)[:: 1 + int(candidates.sum()) // ELEMENTS]
+            samples[light] = sample = np.flatnonzero(candidates)[:: 1 + int(candidates.sum()) // ELEMENTS]
             gain = np.sqrt(gg[light, sample] / ff[light, sample])
             gains[light] = np.median(gain)
-            level = (g[light, sample] - gain * f[light, sample]) / total[light, sample]
-            offsets[light] = _offset_plane(centres[sample], level)
+            levels[light] = (g[light, sample] - gain * f[light, sample]) / total[light, sample]
+    if samples:
+        offsets[[*samples]] = _offset_planes([centres[sample] for sample in samples.values()], [*levels.values()])
     return gains, offsets
 
 
-def _offset_plane(points: FloatArray, values: FloatArray) -> FloatArray:
-    """Fit constant and slopes (3,) of a plane to offsets (M,) at points (M, 2), with Cauchy weights.
+def _offset_planes(points: list[FloatArray], values: list[FloatArray]) -> FloatArray:
+    """Fit constant and slopes (k, 3) of planes to the lights' offsets (M,) at points (M, 2), with Cauchy weights.
 
     Reflections give single elements offsets, too: of the plane the fraction counts that it has of its mean square and
     of the scatter about it together.
     """
-    middle, size = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1.0)
-    basis = np.stack([np.ones(len(points)), *((points - middle) / size).T])
-    functions, held = np.concatenate([basis, values[None]]), np.diag([1e-6, *[1e-3 * len(points)] * 2])
-    plane, deviation = np.array([np.median(values), 0.0, 0.0]), values - np.median(values)
-    scatter = _scatter(deviation)
-    for _ in range(3 if len(points) >= 12 else 0):  # of four elements for each unknown, until the scatter has settled
-        if not scatter:
+    numbers = np.array([*map(len, values)])
+    functions, planes = np.zeros((len(values), 4, numbers.max())), np.zeros((len(values), 3))  # 0 counts nowhere
+    middle = np.array([one.mean(axis=0) for one in points])
+    size = np.array([max(float(np.ptp(one, axis=0).max()), 1.0) for one in points])
+    for light, (at, value) in enumerate(zip(points, values, strict=True)):
+        functions[light, :, : len(value)] = np.ones(len(value)), *((at - middle[light]) / size[light]).T, value
+        planes[light, 0] = np.median(value)
+    basis, held = functions[:, :3], np.multiply.outer(numbers, np.diag([1e-9, 1e-3, 1e-3]))
+    for _ in range(12):  # 4 do
+        fitted = np.einsum("la,lam->lm", planes, basis)  # no BLAS, whose sums may depend on threads
+        deviation = np.abs(functions[:, 3] - fitted)
+        # the standard deviation of a normal distribution with the same median
+        scatter = [1.5 * np.partition(one[:n], n // 2)[n // 2] for one, n in zip(deviation, numbers, strict=True)]
+        weight = 1 / (1 + (deviation / np.maximum(scatter, 1e-30)[:, None]) ** 2)
+        sums, last = np.einsum("lam,lbm->lab", basis * weight[:, None], functions), planes
+        planes = np.linalg.solve(sums[..., :3] + held, sums[..., 3:])[..., 0]
+        planes = np.where(numbers[:, None] >= 12, planes, last)  # four elements for each unknown
+        if (np.abs(planes - last).max(axis=1) <= np.multiply(0.01, scatter)).all():  # it is known to less
             break
-        weight = np.ones(len(points))
-        for _ in range(5):  # as in `robust_fit`
-            sums = np.einsum("am,bm->ab", basis * weight, functions)  # no BLAS, whose sums may depend on threads
-            plane = np.linalg.solve(sums[:, :3] + held, sums[:, 3])
-            deviation = values - np.einsum("a,am->m", plane, basis)
-            weight = 1 / (1 + (deviation / scatter) ** 2)
-        scatter = _scatter(deviation)
-    square = float((np.einsum("a,am->m", plane, basis) ** 2).mean())
-    plane = plane * square / max(square + scatter**2, 1e-300)
-    slopes = plane[1:] / size
-    return np.array([plane[0] - slopes @ middle, *slopes])
-
-
-def _scatter(values: FloatArray) -> float:
-    """Return the standard deviation of a normal distribution with the same median of the absolute values."""
-    return 1.5 * float(np.median(np.abs(values)))
+    square = (fitted**2).sum(axis=1) / numbers
+    planes *= (square / np.maximum(square + np.square(scatter), 1e-300))[:, None]
+    slopes = planes[:, 1:] / size[:, None]
+    return np.column_stack([planes[:, 0] - (slopes * middle).sum(axis=1), slopes])
 
 
 def window_width(

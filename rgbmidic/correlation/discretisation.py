@@ -22,13 +22,13 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import Brightness, GainFit
+from rgbmidic.correlation.brightness import GainFit
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, gauss_newton_step
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import PrecisionMethod, Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual, curved_deviation
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.uncertainty import robust_loss
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -189,7 +189,7 @@ def _finer_field(
     problem, first = replace(problem, reference=fine), replace(first, reference=fine)
     without, noise = np.zeros((start.size, 0)), None if method is None else prior_weights  # without rigid functions
     equations = Equations.build(fine, weights, without, start, noise)
-    estimate = gauss_newton_step(problem, equations, first.brightness, estimate, first.difference)
+    estimate = gauss_newton_step(problem, equations, first, estimate)
     last = compare(problem, estimate)
     weights, loss = _precision_weights(method, last, prior_weights)
     equations = Equations.build(fine, weights, without, start, noise)
@@ -198,16 +198,14 @@ def _finer_field(
     last = replace(last, difference=_noise_residual(fine, last.difference, correction).difference)
     fitted = estimate.displacement + equations.turned(correction)
     recovery = refined.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
-    straight = refined.without_curvature(last, equations, recovery, fitted)
-    variance = _score_variance(straight, equations.weights) * loss**2
+    variance = _score_variance(last, equations.weights, refined.deviation(equations, recovery, fitted)) * loss**2
     valid = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
     return np.where(valid[:, None], recovery.field(*fitted.T), np.nan), variance[:count], equations.deformation[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
     """Right-hand side (2 N,) of a known difference of all lights (k, P)."""
-    lights = zip(weights, difference, reference.gradient.swapaxes(0, 1), strict=True)
-    return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
+    return reference.assembly.vector(reference.projected(weights, difference, reference.gradient).sum(axis=0))
 
 
 def _precision_weights(
@@ -221,9 +219,12 @@ def _precision_weights(
     return weights, robust_loss(precision, residual.reference, weights)[:, None]
 
 
-def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
+def _score_variance(residual: Residual, weights: FloatImage, deviation: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
-    table, mesh = BlockTable.of(residual, weights, wide=True).together(), residual.reference.mesh
+    table, mesh = (
+        BlockTable.of(residual, weights, deviation=deviation).over_elements().together(),
+        residual.reference.mesh,
+    )
     x, y, information, count = table.sums[0, :4]
     xx, yy, information, count = map(table.windowed_means, (x * x, y * y, information, count))
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
@@ -298,13 +299,10 @@ class _RefinedMesh:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
         return Recovery.over(self.fine.material, active, equations.information(), len(self.mesh.nodes))
 
-    def without_curvature(
-        self, residual: Residual, equations: Equations, recovery: Recovery, fitted: FloatArray
-    ) -> Residual:
-        """Take out what the recovered field (its fit on the finer mesh is `fitted`) has over that fit."""
-        return residual.subtract_curvature(
-            *(equations.turned_back(self.prolonged(nodal)) for nodal in recovery.offset_and_curvature(fitted))
-        )
+    def deviation(self, equations: Equations, recovery: Recovery, fitted: FloatArray) -> FloatImage:
+        """Return what the recovered field has over its fit on the finer mesh, `fitted`; see `curved_deviation`."""
+        nodal = (equations.turned_back(self.prolonged(part)) for part in recovery.offset_and_curvature(fitted))
+        return curved_deviation(self.fine.material, self.fine.pixels.barycentric, *nodal)
 
     def averaged(self, values: FloatArray) -> FloatArray:
         """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
@@ -438,8 +436,8 @@ def _simulate_noise(refined: _RefinedMesh, reference: Reference) -> _NoiseStatis
         noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
         side = _right_side(fine, fine.pixel_weights, noise)
         solution = finer.solve(side).reshape(-1, 2)
-        residual = refined.without_curvature(_noise_residual(fine, noise, solution), finer, fine_recovery, solution)
-        residual_variance += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises
+        residual, deviation = _noise_residual(fine, noise, solution), refined.deviation(finer, fine_recovery, solution)
+        residual_variance += _score_variance(residual, fine.pixel_weights, deviation)[:count] / _CONSTANTS.noises
         energy += float(side @ side) / float((right**2).sum()) * _CONSTANTS.draws / _CONSTANTS.noises
     if not mesh.is_graded:
         residual_variance[:] = residual_variance.mean(axis=0)
@@ -467,11 +465,5 @@ def _noise_residual(reference: Reference, noise: FloatImage, field: FloatArray) 
     motion = np.empty((2, noise.shape[1]), dtype=np.float32)
     interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, motion)
     difference = noise - reference.gradient[0] * motion[0] - reference.gradient[1] * motion[1]
-    count = len(noise)
-    return Residual(
-        reference=reference,
-        brightness=Brightness(gain=np.ones(count), offset=np.zeros((count, 3)), fit=None),
-        weights=reference.pixel_weights,
-        difference=difference,
-        moments=np.zeros((count, 0, 6)),
-    )
+    moments = np.zeros((len(noise), 0, 6))
+    return Residual(reference=reference, weights=reference.pixel_weights, difference=difference, moments=moments)

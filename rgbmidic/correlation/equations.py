@@ -1,19 +1,17 @@
-"""One pass of the solve: its normal equations, and the Gauss-Newton iterations with them (paper, eq. 3).
+"""The normal equations of the solve, and the Gauss-Newton iteration with them (paper, eq. 3).
 
-The normal equations hold the weighted Hessian of all lights, a weak smoothness for nodes without data, and the rigid
-motions of the lights. They are factorised once a pass; each iteration solves for the increment of the displacement.
+They hold the weighted Hessian of all lights, a weak smoothness for nodes without data, and the rigid motions of the
+lights. They are factorised once for given weights; each iteration solves for the increment of the displacement.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import corrected_vector, differences
 from rgbmidic.correlation.assembly import RigidMotions
-from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
@@ -274,19 +272,48 @@ class Estimate:
         px.
     rigid : ndarray, shape (k, m)
         Coefficients of each light's rigid functions.
+    equations : Equations or None
+        Of the last iteration; None before it.
     increments : tuple of ndarray, shape (N,)
         Motion of each node in every iteration, px.
+    motion : ndarray, shape (N, 2)
+        That of the last one.
     longest : float
-        Largest motion of a textured node, or by a light's rigid motion, in the last iteration, px.
-    has_settled
-        Every textured node did at the end of the iteration, to what it asks for.
+        Largest of a textured node, or by a light's rigid motion, px.
+    ratio : float
+        Of it to that before with the same equations; with others as before, and at most a tenth: it ends at .01 to .06.
+    relaxation : float
+        Fraction of a step that the next iteration takes.
     """
 
     displacement: FloatArray
     rigid: FloatArray
+    equations: Equations | None = None
     increments: tuple[FloatArray, ...] = ()
+    motion: FloatArray = field(default_factory=lambda: np.zeros(1))
     longest: float = float("inf")
-    has_settled: bool = False
+    ratio: float = 0.1
+    relaxation: float = 1.0
+
+    @property
+    def remainder(self) -> float:
+        """Fraction of the last motion that is left to the solution, by a geometric series; 1 where it does not fall."""
+        return self.ratio / (1 - self.ratio) if self.ratio < 0.5 else 1.0
+
+    @property
+    def remaining(self) -> float:
+        """Largest motion that is left, px."""
+        return self.remainder * self.longest
+
+    def has_settled(self, motion: float) -> bool:
+        """Return True if a fifth of a `motion` (px) is left, or what most of the nodes move by falls no more.
+
+        Nodes that wander where nothing matches, a tenth of them, do not keep the others waiting.
+        """
+        if self.remainder < 1 or self.equations is None:
+            return self.remaining <= motion / 5
+        before, last = np.quantile(np.stack(self.increments[-5:])[[0, -1]][:, self.equations.textured], 0.9, axis=1)
+        return bool(last <= motion or (len(self.increments) > 4 and last > before / 2))
 
     def history(self, nodes: BoolArray | slice = slice(None)) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""
@@ -305,64 +332,29 @@ class UnsolvableError(Exception):
         self.history = estimate.history()
 
 
-def compare(problem: Problem, estimate: Estimate, reference: Reference | None = None) -> Residual:
-    """Return the residual at an estimate, with the problem's reference or one that has been adapted."""
-    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate))
+def compare(
+    problem: Problem, estimate: Estimate, reference: Reference | None = None, last: Residual | None = None
+) -> Residual:
+    """Return the residual at an estimate, with the problem's reference or one that has been adapted; see `Residual`."""
+    return Residual.at(reference or problem.reference, problem.deformed, _light_displacements(problem, estimate), last)
 
 
 @stage("iteration")
-def iterate(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> Estimate:
-    """Iterate with one Hessian until no textured node moves by more than the tolerance, or those that do do not settle.
-
-    Where the first step is long, 3 % of it is enough: the weights change with the solution (an inexact Newton
-    method: Dembo, Eisenstat and Steihaug, SIAM J. Numer. Anal. 19, 1982).
-
-    Parameters
-    ----------
-    problem, equations
-        What is solved, and the equations.
-    residual
-        At the `estimate`.
-    estimate
-        From which the iteration begins.
+def gauss_newton_step(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> Estimate:
+    """Take one Gauss-Newton iteration from an estimate, whose residual is known.
 
     Raises
     ------
     UnsolvableError
         The iteration diverged.
     """
-    difference: FloatImage | None = residual.difference
-    remaining, tolerance = problem.options.max_iterations - len(estimate.increments), problem.options.tolerance
-    relaxation, motion, longest = 1.0, np.zeros_like(estimate.displacement), np.inf
-    for _ in range(min(12, remaining)):  # from within half a speckle 4 to 5 do
-        before, last_motion, last_longest = estimate.displacement, motion, longest
-        estimate = gauss_newton_step(problem, equations, residual.brightness, estimate, difference, relaxation)
-        difference, motion, longest = None, estimate.displacement - before, estimate.longest
-        if not np.isfinite(estimate.displacement).all():
-            raise UnsolvableError("the iteration diverged", estimate)
-        if last_longest == np.inf:
-            tolerance = max(tolerance, 0.03 * longest)
-        # nodes that wander where nothing matches do not keep the others waiting
-        most = np.quantile(estimate.increments[-1][equations.textured], 0.9)
-        if longest <= tolerance or (longest > last_longest / 2 and most <= tolerance):
-            break
-        # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken):
-        # from half of a step that the next one takes back each halves the error no longer
-        swing = float((motion * last_motion).sum()) / max(float((last_motion**2).sum()), 1e-30)
-        relaxation /= 1 - swing if swing < -0.5 else 1
-    return replace(estimate, has_settled=longest <= tolerance)
-
-
-def gauss_newton_step(
-    problem: Problem,
-    equations: Equations,
-    brightness: Brightness,
-    estimate: Estimate,
-    difference: FloatImage | None,
-    relaxation: float = 1.0,
-) -> Estimate:
-    """One Gauss-Newton iteration; `difference` is the difference (k, P) of the states at the estimate, if it is."""
-    steps = equations.increment(*_right_sides(problem, equations, brightness, estimate, difference))
+    held = equations.held_side(estimate.displacement)
+    projected = equations.reference.projected(equations.weights, residual.difference)
+    vectors = [equations.reference.assembly.vector(light) for light in projected]
+    sides = [equations.functions.T @ vector for vector in vectors[1:]]
+    steps = equations.increment(held + np.sum(vectors, axis=0), held, np.concatenate(sides) if sides else np.empty(0))
+    is_first = equations is not estimate.equations
+    relaxation = 1.0 if is_first else estimate.relaxation
     motion, shifts = (relaxation * step for step in steps)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
@@ -371,38 +363,23 @@ def gauss_newton_step(
         shifts = shifts.reshape(rigid[1:].shape)
         rigid[1:] += shifts
         longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
-    bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
+    if not np.isfinite(longest):
+        raise UnsolvableError("the iteration diverged", estimate)
+    motion *= np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
+    ratio = min(estimate.ratio, 0.1) if is_first else longest / max(estimate.longest, 1e-30)
+    # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken):
+    # from half of a step that the next one takes back each halves the error no longer
+    swing = 0.0 if is_first else float((motion * estimate.motion).sum() / max((estimate.motion**2).sum(), 1e-30))
     return Estimate(
-        displacement=estimate.displacement + bounded,
+        displacement=estimate.displacement + motion,
         rigid=rigid,
+        equations=equations,
         increments=(*estimate.increments, length),
+        motion=motion,
         longest=longest,
+        ratio=ratio,
+        relaxation=relaxation / (1 - swing if swing < -0.5 else 1),
     )
-
-
-def _right_sides(
-    problem: Problem,
-    equations: Equations,
-    brightness: Brightness,
-    estimate: Estimate,
-    estimate_difference: FloatImage | None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
-    reference, assembly, weights = equations.reference, equations.reference.assembly, equations.weights
-    held = equations.held_side(estimate.displacement)
-    if estimate_difference is not None:
-        projected = reference.projected(weights, estimate_difference, reference.gradient)
-    else:
-        deformed, pixels, difference = problem.deformed, reference.pixels, np.empty_like(reference.values)
-        for lights, warp in reference.warps(deformed, _light_displacements(problem, estimate)):
-            states = deformed.coefficients[lights], *deformed.weights.shape[1:], reference.values[lights]
-            differences(*states, *warp, pixels.offsets, difference[lights])
-        projected = np.empty((len(weights), len(reference.mesh.elements), 3, 2))
-        fields = weights, difference, *reference.gradient, *reference.brightness_fields(brightness, difference)
-        corrected_vector(*fields, *pixels.positions, projected)
-    vectors = [assembly.vector(light) for light in projected]
-    rigid = [equations.functions.T @ vector for vector in vectors[1:]]
-    return held + np.sum(vectors, axis=0), held, np.concatenate(rigid) if rigid else np.empty(0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:

@@ -42,8 +42,6 @@ def with_consistent_gradient(residual: Residual, weights: FloatImage) -> Referen
 def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, FloatArray]:
     """Bias at the nodes, from the table of a solution and the equations it was found with; none with one light.
 
-    Where a light's displacement changes within the window by more than chance, it is taken in a window of a third.
-
     Returns
     -------
     bias : ndarray, shape (N, 2)
@@ -51,28 +49,45 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     std : ndarray, shape (N, 5)
         Standard uncertainty that is left of u, v, exx, eyy and exy: the slopes have that of a field of its correlation.
     """
-    nodes, constants, count = table.reference.mesh.nodes, table.reference.constants, len(table.sums)
-    if count == 1:
+    nodes, constants = table.reference.mesh.nodes, table.reference.constants
+    if len(table.sums) == 1:
         return np.zeros_like(nodes), np.zeros((len(nodes), 5))
     displacement, variance, information = table.displacement(constants.bias_range)
-    local, chance, _ = table.displacement(constants.local_bias_range)
-    local_change = local - displacement
-    gain = np.maximum(1 - constants.local_bias_threshold * chance / np.maximum((local_change**2).sum(axis=1), 1e-30), 0)
-    local_change *= gain[:, None]
-    displacement = displacement + local_change
+    change, change_variance = _local_change(table, displacement)
+    displacement = displacement + change
     precision = information / np.maximum(information.sum(axis=0), 1e-30)
-    consensus, consistency = consensus_weights(displacement, variance, precision)
-    fractions = precision + consistency * (consensus - precision)
-    mean = (fractions[:, None] * displacement).sum(axis=0)
-    variance += 2 * chance * gain  # twice: its scatter is taken about the local displacement itself
-    scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
-    residual_variance = count / (count - 1) * (fractions[:, None] ** 2 * scatter).sum(axis=0)
-    residual_variance += ((fractions - precision)[:, None] * local_change).sum(axis=0) ** 2
+    consensus, agreement = consensus_weights(displacement, variance, precision)
+    shift = agreement * (consensus - precision)
+    remaining = _variance_of_mean(displacement, variance + change_variance, precision + shift)
+    remaining += (shift[:, None] * change).sum(axis=0) ** 2
+    # where none agree all are displaced, to the sides of their lamps, and an estimate from so few needs both directions
     across = constants.bias_across
-    where_none_agree = 2 / (count + 1) * ((1 - across) * residual_variance + across * residual_variance[::-1])
-    residual_variance = consistency * residual_variance + (1 - consistency) * where_none_agree
-    off = mean - (precision[:, None] * displacement).sum(axis=0)
-    bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
+    none_agree = 2 / (len(displacement) + 1) * ((1 - across) * remaining + across * remaining[::-1])
+    remaining = agreement * remaining + (1 - agreement) * none_agree
+    correction = (shift[:, None] * displacement).sum(axis=0)
+    bias, square = table.at(np.concatenate([correction, remaining]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
     reach = np.sqrt(2) * BIAS_CORRELATION_RANGE
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)
+
+
+def _local_change(table: BlockTable, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Change (k, 2, h, w) of the lights' displacement within its window beyond chance, and its variance (k, h, w).
+
+    It is that of a window of a third, less what chance makes of it (James and Stein 1961).
+    """
+    constants = table.reference.constants
+    local, chance, _ = table.displacement(constants.local_bias_range)
+    change = local - displacement
+    gain = np.maximum(1 - constants.local_bias_threshold * chance / np.maximum((change**2).sum(axis=1), 1e-30), 0)
+    return change * gain[:, None], 2 * chance * gain  # twice: its scatter is taken about the local displacement itself
+
+
+def _variance_of_mean(displacement: FloatArray, variance: FloatArray, weights: FloatArray) -> FloatArray:
+    """Variance (2, h, w) of the weighted mean of lights whose biases are independent, from their scatter beyond chance.
+
+    `displacement` is (k, 2, h, w), its `variance` by chance and the `weights` are (k, h, w).
+    """
+    mean, count = (weights[:, None] * displacement).sum(axis=0), len(weights)
+    scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
+    return np.asarray(count / (count - 1) * (weights[:, None] ** 2 * scatter).sum(axis=0))

@@ -22,10 +22,8 @@ from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
 from rgbmidic.correlation.brightness import (
-    Brightness,
     BrightnessModel,
     GainFit,
-    gain_and_offset,
     window_width,
 )
 from rgbmidic.correlation.constants import USUAL, SolverConstants
@@ -343,50 +341,6 @@ class Reference(Derivable):
             constants=constants,
         )
 
-    def brightness_of(self, weights: FloatImage, moments: FloatArray, is_changed: bool) -> Brightness:
-        """Estimate gain and offset of deformed images.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (k, P), float32
-            Weights of the pixels that both states show.
-        moments : ndarray, shape (k, E, 6)
-            As of `Residual`.
-        is_changed
-            The weights are not the `pixel_weights`: where pixels are saturated, or off the frame.
-
-        Returns
-        -------
-        Brightness
-        """
-        gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
-        if self.brightness != "none":
-            centres = self.mesh.centres - self.pixels.bounds[1::-1]
-            gain, offset = gain_and_offset(moments, centres, self.constants.min_gain_correlation)
-        fit = self.gain_fit
-        if fit is not None and is_changed:
-            fit = GainFit.over(self.values, weights, self.pixels, fit.sigma)
-        return Brightness(gain=gain, offset=offset, fit=fit)
-
-    def brightness_fields(self, brightness: Brightness, difference: FloatImage) -> tuple[AnyArray | int, ...]:
-        """Return what makes residuals ``(f - (g - b) / a) / level`` of differences f - g, for kernels.
-
-        Parameters
-        ----------
-        brightness
-            Of the deformed images.
-        difference : ndarray, shape (k, P), float32
-            Of the grey levels.
-
-        Returns
-        -------
-        tuple
-            See `rgbmidic._kernels.owned_pixels.correct_brightness`.
-        """
-        height, width = self.pixels.bounds[2:]
-        scales = brightness.inverse_gains(difference, (height, width), self.constants.least_gain)
-        return self.values, self.inverse_level, *scales, brightness.offset, self.pixels.lines, self.pixels.run_offsets
-
     @property
     def gain_window(self) -> float | None:
         """Standard deviation (px) of the window of the gain; None where the gain is one number."""
@@ -421,8 +375,7 @@ class Reference(Derivable):
         add_second_derivatives(
             factors, self.images, self.pixels.lines, self.pixels.run_offsets, first_row, first_column, values
         )
-        fit = self.gain_fit and GainFit.over(values, self.pixel_weights, self.pixels, self.gain_fit.sigma)
-        return replace(self, values=values, gain_fit=fit)
+        return replace(self, values=values)  # whose means over the window of a gain are the same
 
     def with_gain_window(self, sigma: float) -> Reference:
         """Return the reference with a gain that is smooth over a narrower window.
@@ -515,17 +468,17 @@ class Reference(Derivable):
         """
         return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
-    def projected(self, weights: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
-        """Sum the right-hand sides of lights over each element: ``sum w (f - g) grad f phi``.
+    def projected(
+        self, weights: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage] | None = None
+    ) -> FloatArray:
+        """Sum the right-hand sides of lights over each element: ``sum w r grad f phi``.
 
         Parameters
         ----------
-        weights : ndarray, shape (k, P) or (P,)
-            Weight w of every owned pixel.
-        difference : ndarray, shape (k, P) or (P,)
-            Difference f - g of the grey levels.
+        weights, difference : ndarray, shape (k, P) or (P,)
+            Weight w and residual r at every owned pixel.
         gradient : iterable of ndarray, shape (k, P) or (P,)
-            Gradient of the grey level along x and y.
+            Along x and y, if it is not the reference's own.
 
         Returns
         -------
@@ -533,6 +486,7 @@ class Reference(Derivable):
             By element, corner and axis.
         """
         vectors = np.empty((*weights.shape[:-1], len(self.mesh.elements), 3, 2))
+        gradient = self.gradient if gradient is None else gradient
         fields = (np.atleast_2d(field) for field in (weights, difference, *gradient))
         element_vector(*fields, *self.pixels.positions, vectors.reshape(-1, *vectors.shape[-3:]))
         return vectors
@@ -582,15 +536,14 @@ def warp_arguments(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tupl
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
-    initial_weights = np.ones_like(images) if weights is None else weights
-    usable, reach = np.zeros_like(images), usable_reach(prefilter)
-    for image, weight, out in zip(images, initial_weights, usable, strict=True):
+    usable, reach = np.ones_like(images) if weights is None else weights.copy(), usable_reach(prefilter)
+    for image, weight in zip(images, usable, strict=True):
         if weight.min() > 0 and np.isfinite(image.sum()):  # NaN and infinity spread to it
-            out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
+            weight[:reach] = weight[-reach:] = weight[:, :reach] = weight[:, -reach:] = 0
         else:
             valid = np.isfinite(image)
             valid &= weight > 0
-            cv2.copyTo(weight, usable_pixels(valid, prefilter).view(np.uint8), out)
+            weight[~usable_pixels(valid, prefilter)] = 0
     return usable
 
 

@@ -327,9 +327,8 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
     The sums are NaN where a node has no displacement.
     """
     residual, has_displacement = _residual(reference, deformed, displacement, rigid)
-    lights = zip(residual.weights, residual.difference, reference.gradient.swapaxes(0, 1), strict=True)
-    total = np.sum([reference.projected(*light).sum(axis=1) for light in lights], axis=0)
-    return np.where(has_displacement[:, None], total, np.nan)
+    projected = reference.projected(residual.weights, residual.difference, reference.gradient)
+    return np.where(has_displacement[:, None], projected.sum(axis=(0, 2)), np.nan)
 
 
 def _residual(

@@ -16,18 +16,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import compare_states, element_squares, find_changed_weights
-from rgbmidic._kernels.owned_pixels import correct_brightness, subtract_quadratic
+from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import ELEMENTS, Brightness, gain_and_offset
+from rgbmidic.correlation.brightness import GainFit, gain_and_offset, inverse_gains
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.robust_fit import robust_fit
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.precision import Precision
 
 
-@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
     """Both states at the owned pixels of the reference.
@@ -36,14 +34,14 @@ class Residual:
     ----------
     reference
         The reference state.
-    brightness
-        Of the deformed images.
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f.
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
+    gain_fit
+        Of the local gains of g over f; None where the gain is one number.
 
     Examples
     --------
@@ -57,13 +55,19 @@ class Residual:
     """
 
     reference: Reference
-    brightness: Brightness
     weights: FloatImage
     difference: FloatImage
     moments: FloatArray
+    gain_fit: GainFit | None = None
 
     @classmethod
-    def at(cls, reference: Reference, deformed: Deformed, displacements: Sequence[FloatArray]) -> Residual:
+    def at(
+        cls,
+        reference: Reference,
+        deformed: Deformed,
+        displacements: Sequence[FloatArray],
+        last: Residual | None = None,
+    ) -> Residual:
         """At one nodal displacement (N, 2) per light.
 
         Parameters
@@ -72,6 +76,8 @@ class Residual:
             Images of both states.
         displacements : sequence of ndarray, shape (N, 2)
             Nodal displacement of every light in px.
+        last
+            Residual whose weights it takes, if they stay as they are.
 
         Returns
         -------
@@ -79,19 +85,29 @@ class Residual:
         """
         values, pixels, shape = reference.values, reference.pixels, deformed.weights.shape[1:]
         moments, difference = np.empty((len(values), len(reference.mesh.elements), 6)), np.empty_like(values)
-        is_changed = np.empty(moments.shape[:2], dtype=bool)
-        warps = list(reference.warps(deformed, displacements))
-        for lights, warp in warps:
-            find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
-        weights = reference.pixel_weights.copy() if is_changed.any() else reference.pixel_weights
+        is_changed, warps = np.zeros(moments.shape[:2], dtype=bool), list(reference.warps(deformed, displacements))
+        weights, fit = (reference.pixel_weights, reference.gain_fit) if last is None else (last.weights, last.gain_fit)
+        if last is None:
+            for lights, warp in warps:
+                find_changed_weights(deformed.nonuniform_weight_blocks[lights], *shape, *warp, is_changed[lights])
+        if is_changed.any():
+            weights = weights.copy()
         for lights, warp in warps:
             states = deformed.coefficients[lights], deformed.weights[lights], values[lights]
             reference_weights = reference.pixel_weights[lights], is_changed[lights]
             outputs = difference[lights], weights[lights], moments[lights]
             compare_states(*states, *reference_weights, *warp, pixels.offsets, *outputs)
-        brightness = reference.brightness_of(weights, moments, bool(is_changed.any()))
-        correct_brightness(*reference.brightness_fields(brightness, difference), pixels.offsets, difference)
-        return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
+        height, width = pixels.bounds[2:]
+        if fit is not None and is_changed.any():
+            fit = GainFit.over(values, weights, pixels, fit.sigma)
+        gain, offset = np.ones(len(values)), np.zeros((len(values), 3))
+        if reference.brightness != "none":
+            centres = reference.mesh.centres - pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, reference.constants.min_gain_correlation)
+        scales = inverse_gains(difference, gain, offset, fit, (height, width), reference.constants.least_gain)
+        rows = pixels.lines, pixels.run_offsets, pixels.offsets
+        correct_brightness(values, reference.inverse_level, *scales, offset, *rows, difference)
+        return cls(reference=reference, weights=weights, difference=difference, moments=moments, gain_fit=fit)
 
     @property
     def contrast(self) -> float:
@@ -163,31 +179,11 @@ class Residual:
     @property
     def smooth_fraction(self) -> float:
         """Fraction of the squares that is alike over blocks of the gain's window; 0 where the gain is one number."""
-        if (fit := self.brightness.fit) is None:
+        if (fit := self.gain_fit) is None:
             return 0.0
         smooth, total = fit.block_sums(self.difference).astype(np.float64), fit.totals
         squares = float(self.squares(self.weights)[..., 0].sum())
         return float((smooth**2 / np.maximum(total, 1e-30)).sum()) / max(squares, 1e-300)
-
-    def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
-        """Take out what a curved field has over its own linear fit.
-
-        Parameters
-        ----------
-        nodal_offset : ndarray, shape (N, 2)
-            What the fit has at the nodes beyond the field, px, in the axes of the reference.
-        curvature : ndarray, shape (N, 2, 3)
-            Second derivatives xx, xy, yy of the field at the nodes, 1/px, in the axes of the reference.
-
-        Returns
-        -------
-        Residual
-        """
-        reference, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
-        deviation = curved_deviation(reference.material, pixels.barycentric, nodal_offset, curvature)
-        pixel_positions = pixels.local_x, pixels.local_y, pixels.offsets
-        subtract_quadratic(self.difference, *reference.gradient, deviation, *pixel_positions, out)
-        return replace(self, difference=out)
 
 
 class PrecisionMethod(Protocol):
@@ -252,60 +248,6 @@ def curved_deviation(
     deviation = sag.transpose(0, 2, 1) @ products
     deviation[..., :3] -= nodal_offset[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
-
-
-_MIN_PIXELS = 12
-"""Pixels of an element that must be known in both states: a contrast of 12 values is known to 20 % (derived)."""
-
-
-def brightness_change(
-    first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
-) -> FloatArray:
-    """Return gain and offset of every light, ``second = gain first + offset``, between two states in grey levels.
-
-    They are those of `gain_and_offset`, whatever the solve takes of them, against the first reference, and of a lamp
-    that is off, too: the gain is what the lamp gives, the offset what the mean has beyond that (reflections, stray
-    light) in the middle of the elements.
-
-    Parameters
-    ----------
-    first, second : ndarray, shape (k, H, W)
-        Images of the two states in grey levels, of one size or not; NaN where unknown.
-    reference
-        Mesh and pixels of the reference state.
-    displacement : ndarray, shape (N, 2)
-        Of the nodes in px, from their place in the first images to that in the second; elements with a node that is NaN
-        are left out.
-
-    Returns
-    -------
-    ndarray, shape (k, 2)
-        Gain and offset (grey levels); NaN where no element is seen in both states.
-    """
-    mesh, pixels, sample_count = reference.mesh, reference.pixels, 36  # a contrast of 36 pixels is known to 12 %
-    elements = np.arange(0, len(mesh.elements), 1 + len(mesh.elements) // ELEMENTS)
-    motion, size = displacement[mesh.elements[elements]].mean(axis=1), np.diff(pixels.offsets)[elements]
-    usable = np.isfinite(motion).all(axis=1) & (size >= _MIN_PIXELS)
-    if not usable.any():
-        return np.full((len(first), 2), np.nan)
-    elements, step, size = elements[usable], np.round(motion[usable]).astype(np.int64), size[usable]
-    slots = pixels.offsets[elements, None] + np.arange(sample_count) * size[:, None] // sample_count
-    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[elements, :1]
-    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[elements, 1:]
-    height, width = second.shape[1:]
-    across, down = columns + step[:, :1], rows + step[:, 1:]
-    inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
-    f = first[:, rows, columns].astype(np.float64)
-    g = second[:, np.clip(down, 0, height - 1), np.clip(across, 0, width - 1)].astype(np.float64)
-    valid = inside & np.isfinite(f) & np.isfinite(g)
-    valid &= valid.sum(axis=-1, keepdims=True) >= _MIN_PIXELS
-    f, g = np.where(valid, f, 0), np.where(valid, g, 0)
-    moments = np.stack(
-        [valid.sum(axis=-1), *(product.sum(axis=-1) for product in (f, g, f * f, f * g, g * g))], axis=-1
-    )
-    centres = mesh.centres[elements]
-    gain, offset = gain_and_offset(moments, centres - centres.mean(axis=0), -1.0)
-    return np.stack([gain, np.where(np.isfinite(gain), offset[:, 0], np.nan)], axis=1)
 
 
 _FITTED_PAIRS = 12

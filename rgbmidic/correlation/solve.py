@@ -7,9 +7,9 @@ is ``u + R beta_j`` and its derivative is the light's Hessian times R. The gradi
 that of the deformed one, carried along by the deformation gradient of the surface, so the Hessian is constant as long
 as the weights are (docs: how it works).
 
-The loop is: assemble the equations, solve them by Gauss-Newton iterations, compare the states, weigh elements and
-lights; until the weights have converged; then conclude. Every step is a function from frozen states to a frozen state,
-and none depends on how many came before.
+The loop is: compare the states, weigh elements and lights where little of the motion is left, assemble the equations
+where the weights have changed, take a Gauss-Newton step; until neither changes; then conclude. Every step is a function
+from frozen states to a frozen state, and none depends on how many came before.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ import numpy as np
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
+from rgbmidic.correlation.conclusion import conclude
 from rgbmidic.correlation.equations import (
     Equations,
     Estimate,
     Problem,
     UnsolvableError,
     compare,
-    iterate,
+    gauss_newton_step,
 )
-from rgbmidic.correlation.light_bias import light_bias, with_consistent_gradient
-from rgbmidic.correlation.nodes import classify_nodes, matching_elements, misfit, one_sided_texture
+from rgbmidic.correlation.light_bias import with_consistent_gradient
+from rgbmidic.correlation.nodes import matching_elements, one_sided_texture
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, refine_by_patch_matching
-from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
-from rgbmidic.correlation.uncertainty import excess_over_chance, gradient_step, standard_uncertainty
+from rgbmidic.correlation.solution import NO_MATCH, Solution
+from rgbmidic.correlation.uncertainty import standard_uncertainty
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -139,10 +139,9 @@ def _held_elements(
 
     A one-sided texture does not hold a node either, but matches.
     """
-    if matched.all() and estimate.has_settled:
+    if matched.all() and estimate.remaining <= problem.constants.reweight_motion / 5:
         return matched
-    table = BlockTable.of(residual, equations.weights, wide=True).together()
-    std = standard_uncertainty(residual, table, equations, last.precision)
+    std = standard_uncertainty(BlockTable.of(residual, equations.weights), equations, last.precision)
     lost = (std.max(axis=1) > problem.constants.max_std) & ~one_sided_texture(equations, residual)
     return np.asarray(matched & ~lost[problem.reference.mesh.elements].any(axis=1))
 
@@ -217,16 +216,26 @@ def solve(
 
 
 def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> Solution:
-    options = problem.options
+    tolerance = problem.options.tolerance
     estimate, weighting = _refine_initial_guess(problem, estimate, residual)
-    for _ in range(8):  # two or three do, but where elements come and go
-        equations = assemble(problem, weighting, estimate)
-        estimate = iterate(problem, equations, weighting.residual, estimate)
-        weighting = weigh(problem, weighting, equations, estimate)
-        is_settled = estimate.longest <= options.tolerance and weighting.has_converged(equations)
-        if is_settled or len(estimate.increments) >= options.max_iterations:
+    equations, are_final = assemble(problem, weighting, estimate), False
+    for _ in range(problem.options.max_iterations):
+        estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
+        if are_final and estimate.remaining <= tolerance / 5:
             break
+        if estimate.has_settled(problem.constants.reweight_motion):
+            weighting = weigh(problem, weighting, equations, estimate)
+            are_final = weighting.has_converged(equations)
+            equations = equations if are_final else assemble(problem, weighting, estimate)
+        else:
+            weighting, are_final = follow(problem, weighting, estimate), False
     return conclude(problem, estimate, equations, weighting)
+
+
+@stage("iteration")
+def follow(problem: Problem, last: Weighting, estimate: Estimate) -> Weighting:
+    """Compare the states at an estimate, with the weights as they are."""
+    return replace(last, residual=compare(problem, estimate, last.residual.reference, last.residual))
 
 
 @stage("search")
@@ -280,87 +289,3 @@ def _nothing_left(weighting: Weighting) -> str:
     if not weighting.residual.weights.any():
         return "no light sees the region: every weight is zero"
     return "the images have no texture in the region"
-
-
-@stage("conclusion")
-def conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
-    """Conclude the solve: which nodes count as measured, their values and uncertainty."""
-    reference, mesh = weighting.residual.reference, problem.reference.mesh
-    active = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(reference.material, active, equations.information())
-    fitted = estimate.displacement
-    residual = weighting.residual.subtract_curvature(*map(equations.turned_back, recovery.offset_and_curvature(fitted)))
-    table = BlockTable.of(residual, equations.weights, wide=True).together()
-    std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
-    if len(equations.weights) > 1:
-        step = recovery.value @ gradient_step(weighting.residual, equations)
-        excess = excess_over_chance(step, std[:, :2], residual, table, equations.weights)
-        std = std * np.hypot(1, excess)[:, None]
-    bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
-    if weighting.precision is not None:
-        bias, bias_std = light_bias(BlockTable.of(residual, equations.weights), equations)
-    sensitivity = table.sensitivity(mesh.nodes)
-    scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
-    fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
-    field = recovery.field(*fitted.T)
-    # nodes that swing between two matches: where they are few their values are not known, else the frame's are not
-    is_moving = estimate.increments[-1] > problem.options.tolerance
-    if is_moving.mean() < problem.constants.max_oscillating_fraction:
-        std = np.where(is_moving[:, None], np.nan, std)
-    positions = mesh.nodes + field[:, :2] - reference.offset(problem.deformed)
-    inside = problem.deformed.contains(positions, std[:, :2])
-    node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
-    measured = np.asarray(node_status == NodeStatus.MEASURED)
-    if not measured.any() and np.isnan(std[equations.textured]).all():
-        raise UnsolvableError(
-            "the region is too small for its elements: nothing is left of the noise to state an uncertainty", estimate
-        )
-    if not measured.any():
-        along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
-        one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
-        raise UnsolvableError(one_sided if along.any() else NO_MATCH, estimate)
-    if equations.rigid is not None and equations.rigid.unobservable.any():
-        numbers = [str(number) for number in np.flatnonzero(equations.rigid.unobservable)]
-        subject = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
-        raise UnsolvableError(
-            f"{subject} too little seen texture with light 0 (the first), directly or through others, to tell a rigid "
-            "motion from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
-            'solver.rigid = "none"',
-            estimate,
-        )
-    inner = measured & ~mesh.adjacent_nodes(~measured) & (mesh.to_nodes(active.astype(np.float64)) > 0)
-    squares = weighting.residual.squares(equations.weights)
-    square, total, _ = squares.sum(axis=1).T
-    sample = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
-    total_weight, history = sample.sum(axis=0), estimate.history(measured)
-    converged = bool(history[-1] <= problem.options.tolerance)
-    return replace(
-        Solution.failed(mesh, len(reference.images), "", history),
-        displacement=np.where(measured[:, None], field[:, :2], np.nan),
-        displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
-        bias_std=np.where(measured[:, None], bias_std[:, :2], np.nan),
-        edge_std=np.where(measured[:, None], np.zeros(2), np.nan),
-        strain=np.where(inner[:, None], field[:, 2:], np.nan),
-        strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
-        node_status=node_status,
-        light_fraction=equations.light_fraction,
-        misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
-        status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
-        reason="" if converged else _unsettled(problem, estimate, measured),
-        rigid=np.where(total[:, None] > 0, estimate.rigid, np.nan),
-        residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
-        weight_fraction=np.mean(
-            sample / np.where(total_weight > 0, total_weight, np.float32(1)), axis=1, dtype=np.float64
-        ),
-    )
-
-
-def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
-    """Report which of the `measured` nodes (N,) the last iteration still moved, and where."""
-    motion, tolerance = np.where(measured, estimate.increments[-1], 0.0), problem.options.tolerance
-    x, y = problem.reference.mesh.nodes[motion.argmax()] + problem.reference.origin
-    return (
-        f"iteration {len(estimate.increments)}, the last, still moved {int((motion > tolerance).sum())} of "
-        f"{int(measured.sum())} nodes by more than the tolerance of {tolerance:g} px, most the one at x {x:.0f}, "
-        f"y {y:.0f}: by {motion.max():.3g} px"
-    )

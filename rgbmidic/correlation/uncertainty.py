@@ -6,7 +6,6 @@ The scores' covariance is the information times the design effect of the table o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -18,7 +17,6 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh.recovery import Functional, Recovery, functional_std
-from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic.weights.precision import Precision
 
@@ -38,7 +36,7 @@ def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     Parameters
     ----------
     table
-        Of the solution.
+        Of the solution, of all lights together.
     texture : ndarray, shape (E, 3, 3, 3)
         Element blocks of its Hessian.
     """
@@ -47,35 +45,28 @@ def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     return np.asarray(texture * scale[:, None, None])
 
 
-def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple[int, int, FloatArray]]:
+def light_covariances(table: BlockTable, equations: Equations) -> Iterator[tuple[int, int, FloatArray]]:
     """Covariance of the right-hand sides of each two lights a and b >= a.
 
     A light's own is as in `score_covariance`; that of two is the root of both, times the correlation of their scores
     where both see. Of what the lights have in common the fit leaves the fraction `residual_leverage`, which is put back
-    before the scores are summed; it takes nothing of what they differ by.
+    before: each light has its fraction of the information of it. The fit takes nothing of what they differ by.
 
     Parameters
     ----------
-    residual
-        At the solution.
-    weights : ndarray, shape (k, P), float32
-        Of the solve.
+    table
+        Of the solution, of each light.
+    equations
+        Of the solution.
 
     Yields
     ------
     tuple
         Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
-    reference = residual.reference
-    mesh, pixels, slopes = reference.mesh, reference.pixels, reference.gradient
-    score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
-    information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
-    common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
-    lost = np.asarray(1 / np.sqrt(reference.residual_leverage) - 1, dtype=np.float32)
-    if lost.ndim:
-        lost = np.repeat(lost, np.diff(pixels.offsets))
-    full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
-    table = BlockTable.of(replace(residual, difference=full_difference), weights, wide=True)
+    reference, weights = table.reference, equations.weights
+    mesh, slopes = reference.mesh, reference.gradient
+    table = table.over_elements().with_common_scores()
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
     roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
@@ -106,22 +97,8 @@ def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> 
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-def _in_reference_axes(functional: Functional, deformation: FloatArray) -> Functional:
-    """Return a quantity linear in the displacement as one of the motion in axes that follow the surface."""
-    matrices = [matrix for matrix in functional if matrix is not None]  # of one structure
-    axes = [axis for axis, matrix in enumerate(functional) if matrix is not None]
-    along_x, along_y = (
-        with_data(
-            matrices[0],
-            sum(matrix.data * row[axis][matrix.indices] for matrix, axis in zip(matrices, axes, strict=True)),
-        )
-        for row in deformation.T
-    )
-    return along_x, along_y
-
-
 def _rigid_variance(
-    residual: Residual, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
+    table: BlockTable, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
 ) -> FloatArray:
     """Variance (N, F) that the error of the rigid coefficients adds to quantities linear in the displacement.
 
@@ -130,19 +107,21 @@ def _rigid_variance(
     the covariance of q_j and q_l a quantity ``a^T u`` gets ``(a^T X) Cov(e) (X^T a) - 2 (a^T M^-1 Cov(q, e)) (X^T a)``,
     where ``Cov(e) = sum G_j^T S_jl G_l`` and ``Cov(q, e) = sum S_jl G_l``.
     """
-    gains, assembly = rigid.relative_modes @ rigid.inverse, residual.reference.assembly
+    gains, assembly = rigid.relative_modes @ rigid.inverse, table.reference.assembly
     products = np.zeros_like(gains)
-    for a, b, blocks in light_covariances(residual, equations.weights):
+    for a, b, blocks in light_covariances(table, equations):
         covariance = assembly.matrix(blocks)
         products[a] += covariance @ gains[b]
         if a != b:
             products[b] += covariance @ gains[a]
     coefficients = np.einsum("jnc,jnd->cd", gains, products)
-    shared, variance = equations.solve(products.sum(axis=0)), []
-    for along_x, along_y in functionals:
+    motions = (rigid.response, equations.solve(products.sum(axis=0)))
+    by_axis = [equations.turned(motion.reshape(len(motion) // 2, 2, -1)).swapaxes(0, 1) for motion in motions]
+    variance = []
+    for functional in functionals:
         response, common = (
-            sum(matrix @ column[axis::2] for axis, matrix in enumerate((along_x, along_y)) if matrix is not None)
-            for column in (rigid.response, shared)
+            sum(matrix @ along for matrix, along in zip(functional, axes, strict=True) if matrix is not None)
+            for axes in by_axis
         )
         variance.append(((response @ coefficients - 2 * common) * response).sum(axis=1))
     return np.stack(variance, axis=1)
@@ -160,29 +139,31 @@ def _probed_std(
     """
     mesh, assembly, lost = reference.material, reference.assembly, reference.constants.max_std
     limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(quantities) - 2), assembly.matrix(scores)
-    std = functional_std(equations.solve, covariance, mesh, quantities)
+
+    def solve(columns: FloatArray) -> FloatArray:
+        """Solve for functionals (2 N, R) of the displacement, which the surface has turned."""
+        turned = np.swapaxes(equations.deformation, 1, 2) @ columns.reshape(len(mesh.nodes), 2, -1)
+        return equations.solve(turned.reshape(columns.shape))
+
+    std = functional_std(solve, covariance, mesh, quantities)
     far = np.zeros(std.shape, dtype=bool)
     while ((std > limits) & ~far).any():
         far |= std > limits
         remaining = [
             (functional, nodes & ~excluded) for (functional, nodes), excluded in zip(quantities, far.T, strict=True)
         ]
-        std = np.where(far, std, functional_std(equations.solve, covariance, mesh, remaining))
+        std = np.where(far, std, functional_std(solve, covariance, mesh, remaining))
     if not far.any():
         return std
     score, information = (np.einsum("eaad->ed", blocks)[:, ::2].sum(axis=1) for blocks in (scores, equations.blocks))
     ratio, min_ratio = score / np.maximum(information, 1e-300), np.full(len(std), np.inf)
     np.minimum.at(min_ratio, mesh.elements[information > 0], ratio[information > 0, None])
-    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, remaining)
+    allowed = functional_std(solve, assembly.matrix(equations.blocks), mesh, remaining)
     return np.maximum(std, allowed * np.sqrt(np.where(min_ratio < np.inf, min_ratio, 0))[:, None])
 
 
 def standard_uncertainty(
-    residual: Residual,
-    table: BlockTable,
-    equations: Equations,
-    precision: Precision | None,
-    recovery: Recovery | None = None,
+    table: BlockTable, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
     """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
@@ -192,8 +173,8 @@ def standard_uncertainty(
 
     Parameters
     ----------
-    residual, table, equations, precision
-        Of the last pass.
+    table, equations, precision
+        Of the solution, the table of each light.
     recovery
         Of the field from the linear fit; None for the fit itself.
 
@@ -202,55 +183,49 @@ def standard_uncertainty(
     ndarray, shape (N, 2) or (N, 5)
         Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
     """
-    reference, textured = residual.reference, equations.textured
+    reference, textured = table.reference, equations.textured
     value = sp.eye(len(textured), format="csr") if recovery is None else recovery.value
     quantities: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
     if recovery is not None:
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         quantities += [(functional, inner) for functional in recovery.strain_functionals]
-    quantities = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in quantities]
-    std = _probed_std(equations, score_covariance(table, equations.blocks), reference, quantities)
+    scores = score_covariance(table.over_elements().together(), equations.blocks)
+    std = _probed_std(equations, scores, reference, quantities)
     if equations.rigid is not None:
-        rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in quantities])
+        rigid = _rigid_variance(table, equations, equations.rigid, [functional for functional, _ in quantities])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * robust_loss(precision, reference, equations.weights)[:, None]
     return std
 
 
-def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
-    """Step (N, 2) that the gradients of the lights' own images would make from the solution."""
-    reference = residual.reference
-    images = zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
-    pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in images])
-    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
-    return equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
-
-
-def excess_over_chance(
-    step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
+def gradient_disagreement(
+    residual: Residual, table: BlockTable, equations: Equations, recovery: Recovery, std: FloatArray
 ) -> FloatArray:
-    """Return what the recovered step (N, 2) of `gradient_step` has beyond chance, over the uncertainty, (N,).
+    """Factor (N,) on the uncertainty by what the gradients of the lights' own images disagree with those of the solve.
 
     Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
     uncertainty as the scores of what a light alone shows have of all scores, typically. Where a reflection does not
     follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md). A single step is a poor estimate of its variance: both directions have
-    their mean.
+    (docs/explanation/uncertainty.md): the step that they would make from the solution is stated beyond chance. A single
+    step is a poor estimate of its variance: both directions have their mean.
 
     Parameters
     ----------
-    step, std : ndarray, shape (N, 2)
-        Of u and v.
     residual, table
+        At the solution, of each light.
+    equations, recovery
         Of the solution.
-    weights : ndarray, shape (k, P), float32
-        Of the solve.
+    std : ndarray, shape (N, 5)
+        Standard uncertainty by noise.
     """
-    reference = table.reference
-    images = BlockTable.of(residual, weights, gradient=reference.texture.images, wide=True).together()
-    chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
-        (images.sums - table.sums[:, :4])[0, :2]
-    )
-    square = ((step / np.maximum(std, 1e-30)) ** 2).mean(axis=1)
-    return np.asarray(np.sqrt(np.maximum(square - chance, 0)))
+    reference = residual.reference
+    if len(equations.weights) == 1:
+        return np.ones(len(std))
+    projected = reference.projected(equations.weights, residual.difference, reference.texture.images)
+    pulls = np.array([reference.assembly.vector(light) for light in projected])
+    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
+    step = recovery.value @ equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
+    square = ((step / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
+    chance = np.nan_to_num(reference.residual_leverage).mean() * table.over_elements().disagreement_by_chance()
+    return np.asarray(np.sqrt(1 + np.maximum(square - chance, 0)))

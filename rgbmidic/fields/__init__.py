@@ -15,8 +15,8 @@ from rgbmidic.fields.nodal import (
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
+from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
-from rgbmidic.fields.units import Units
 from rgbmidic.renamed import refuse_old_names
 from rgbmidic.text import format_value, format_with_std
 

@@ -107,8 +107,7 @@ class JumpAlong:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
         previous, following = self._beside
         across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
-        at_stencil = displacement.with_arrays(lambda array: array[..., self.stencil])
-        u, std, bias = at_stencil.values, at_stencil.uncertainty, at_stencil.bias_std
+        u = displacement.values[..., self.stencil]
         jump, arm = u @ across, (self.points[following] - self.points[previous]).T[:, None] + u @ along
         length = np.hypot(*arm)
         tangent = arm / length
@@ -117,10 +116,10 @@ class JumpAlong:
 
         def jump_field(name: str, values: FloatArray, axis: FloatArray, turn: FloatArray) -> Field:
             coefficients = axis[..., None] * across + turn[..., None] * along
-            pairs = enumerate(self.covariances)
+            pairs = enumerate(zip(self.covariances, self.stencil, strict=True))
             square = [
-                covariance.variance(coefficients[:, :, p], std[:, :, p], bias[:, :, p]).sum(axis=0)
-                for p, covariance in pairs
+                covariance.variance(coefficients[:, :, p], displacement.isel(node=row)).sum(axis=0)
+                for p, (covariance, row) in pairs
             ]
             errors = np.sqrt(np.stack(square, axis=1))
             return Field(name=name, unit="px", dims=("frame", "pair"), values=values, std=errors)

@@ -221,19 +221,21 @@ class NodalCovariance:
         flat = [array.reshape(-1, array.shape[-1]) @ factor for array, factor in factors]
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
-    def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+    def variance(self, weights: FloatArray, field: Field) -> FloatArray:
         """Compute the variance of weighted sums of nodal values.
 
         Parameters
         ----------
-        weights, std, bias : ndarray, shape (..., n)
+        weights : ndarray, shape (..., n)
             As of `errors`.
+        field
+            Of the n nodes, shape (..., n).
 
         Returns
         -------
         ndarray, shape (...)
         """
-        return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
+        return np.asarray((self.errors(weights, field.uncertainty, field.bias_std) ** 2).sum(axis=-1))
 
     def of_sums(self, weights: FloatArray, displacement: Displacement) -> FloatArray:
         """Compute the covariance of S weighted sums of each of the c components of a displacement.
@@ -274,6 +276,23 @@ class NodalCovariance:
         """
         fit, bias = (unit_rows(sp.hstack([matrix @ root for matrix in matrices])) for root in (self.fit, self.bias))
         return replace(self, fit=fit, bias=bias)
+
+    def moved(self, displacement: Displacement) -> Self:
+        """Return the covariance with the nodes at their deformed places; those without data stay.
+
+        Parameters
+        ----------
+        displacement
+            Of the N nodes, in the unit of their `points`, shape (c, N).
+
+        Returns
+        -------
+        NodalCovariance
+        """
+        deformed = self.points + np.nan_to_num(displacement.values.T)
+        if self.surface is not None:
+            return replace(self, surface=deformed)
+        return replace(self, mesh=Tri3Mesh(nodes=deformed, elements=self.mesh.elements))
 
     def subset(self, nodes: IntArray) -> Self:
         """Return the covariance of some nodes alone.
@@ -549,6 +568,25 @@ class RigidMotion:
             turned = replace(turned, covariance=covariance, std=np.sqrt(np.einsum("iin->in", covariance)))
         remaining = (arm + displacement.values.T - self.shift.values) @ self.back.T - arm
         return replace(turned, values=remaining.T)
+
+    def removed_gradient(self, gradient: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Turn displacement gradients back by the rotation; those in tangent planes of a surface in space do not turn.
+
+        Parameters
+        ----------
+        gradient : ndarray, shape (G, 2, 2)
+            ``H[c, d]``: derivative of the displacement c by the coordinate d.
+        covariance : ndarray, shape (G, 4, 4)
+            Of each gradient row by row.
+
+        Returns
+        -------
+        gradient, covariance : ndarray
+        """
+        if len(self.back) == 3:
+            return gradient, covariance
+        wide = np.kron(self.back, np.eye(2))
+        return self.back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
 
     @property
     def components(self) -> tuple[Field, ...]:

@@ -21,13 +21,12 @@ import numpy as np
 from rgbmidic.arguments import checked
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.field import Displacement
-from rgbmidic.fields.units import Units
+from rgbmidic.fields.quantity import Units
 from rgbmidic.illumination.calibration import has_schema, read_document, write_document
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.source import Plane
 from rgbmidic.renamed import state_new_names
-from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray, as_numbers
 
@@ -511,15 +510,15 @@ class Rectification:
     units: Units
 
     @classmethod
-    def of(cls, mesh: Tri3Mesh, scale: ScaleSettings, camera: CameraCalibration | None = None) -> Self:
-        """Rectify a mesh in px of the image by a `camera`, or leave it with the `scale`.
+    def of(cls, mesh: Tri3Mesh, units: Units, camera: CameraCalibration | None = None) -> Self:
+        """Rectify a mesh in px of the image by a `camera`, or leave it with the `units`.
 
         Parameters
         ----------
         mesh
             Mesh in px of the image.
-        scale
-            Scale of the result.
+        units
+            Units of the result where there is no camera.
         camera
             Lens and plane; None: the image is not rectified.
 
@@ -533,7 +532,6 @@ class Rectification:
             The camera holds no plane, or the mesh reaches where its distortion has no inverse.
         """
         if camera is None:
-            units = Units(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std)
             return cls(camera=None, image=mesh, mesh=mesh, units=units)
         plane_points = camera.to_mm(mesh.nodes)
         if not np.isfinite(plane_points).all():

@@ -23,9 +23,9 @@ from rgbmidic.fields.history import Probe, of_probe
 from rgbmidic.fields.interpolation import MeshPoints, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
+from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.tangent_plane import gradient_errors, in_tangent_plane
-from rgbmidic.fields.units import Units
 from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
@@ -200,7 +200,7 @@ class Mean:
         Field
             Of the shape (T,).
         """
-        variance = self.covariance.variance(weights, field.uncertainty, field.bias_std)
+        variance = self.covariance.variance(weights, field)
         mean = _products(weights, field.values).sum(axis=1)
         return replace(field, dims=("frame",), values=mean, std=np.sqrt(variance), bias=None)
 

@@ -121,10 +121,12 @@ class ProfileLine:
     ----------
     points : ndarray, shape (P, 2)
         In px on the reference, from the first end to the last.
-    surface : ndarray, shape (P, 3), or None
-        Where the points are on a surface in space, NaN outside of it; None: it is in the mesh's plane.
+    coordinates : ndarray, shape (P, 2) or (P, 3)
+        The points, or on a surface in space where they are, NaN outside of it, in `unit`.
     positions : ndarray, shape (P,)
-        Distance from the first end, px, or along the surface in its unit.
+        Distance from the first end, in space along the surface, in `unit`.
+    unit
+        ``"px"``; in space that of the surface, ``"mm"``.
     nodes : ndarray, shape (n,), int
         Nodes around the line.
     mesh_points
@@ -169,11 +171,12 @@ class ProfileLine:
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside "
                 f"{MeshPoints.of(mesh, mesh.nodes[:1]).bounds_text}"
             )
-        self.points, self.positions = points, np.linspace(0, length, len(points))
+        self.points, self.positions, self.unit = points, np.linspace(0, length, len(points)), "px"
         self.nodes, self.mesh_points = mesh_points.nearby()
-        self.surface = None if covariance.surface is None else mesh_points.read(covariance.surface)
-        if self.surface is not None:
-            steps_in_space = np.linalg.norm(np.diff(self.surface, axis=0), axis=1)
+        self.coordinates = points if covariance.surface is None else mesh_points.read(covariance.surface)
+        if covariance.surface is not None:
+            self.unit = "mm"
+            steps_in_space = np.linalg.norm(np.diff(self.coordinates, axis=0), axis=1)
             outside = np.nanmedian(steps_in_space)  # the surface is not known there
             self.positions = np.append(0.0, np.cumsum(np.where(np.isfinite(steps_in_space), steps_in_space, outside)))
         self._weights = lru_cache(maxsize=4)(partial(_weights, self.mesh_points))
@@ -205,7 +208,7 @@ class ProfileLine:
         near = field.noise.isel(node=self.nodes)
         weights = self._weights(np.isfinite(near.values).tobytes())
         values = weights @ np.nan_to_num(near.values)
-        variance = self.covariances[kind].variance(np.nan_to_num(weights), near.uncertainty, near.bias_std)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), near)
         std = np.where(np.isfinite(values), np.sqrt(variance), np.nan)
         along = replace(near, dims=("position",), values=values, std=std, bias=None)
         if field.common is None:

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import FrameError
-from rgbmidic.frames.metadata import BROKEN_JPEG, StoredFrame, captured_stderr, check_size, damaged_file
+from rgbmidic.disk import require_regular_file
+from rgbmidic.errors import FrameError, damaged_file
+from rgbmidic.frames.metadata import BROKEN_JPEG, StoredFrame, captured_stderr, check_size
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.tiff_pages import Tag, has_uncompressed_data, missing_data, oversized_jpeg, tag, tiff_pages
-from rgbmidic.settings import BAYER_PATTERNS, FrameKind, require_regular_file
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:

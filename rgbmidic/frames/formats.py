@@ -12,15 +12,13 @@ from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
-from rgbmidic.frames.bitmaps import BmpFile, PgmFile
+from rgbmidic.extensions import FRAME_FORMATS
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
-from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.images import HeaderlessFile, PngFile
 from rgbmidic.frames.metadata import CameraMetadata
-from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
-from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
+from rgbmidic.frames.source import FrameSource, split_dataset
+from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile
 from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
@@ -79,6 +77,11 @@ class FrameFormat:
         return self.recognises(path, user_metadata)
 
 
+def _is_headerless(path: Path, user_metadata: FrameSettings) -> bool:
+    """Return whether a file has no header: .bin, and .raw whose shape is stated, as some cameras' .raw have one."""
+    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and user_metadata.shape is not None)
+
+
 def _is_tiff(path: Path, _: FrameSettings) -> bool:
     return path.suffix.lower() in TIFF_ENDINGS and not is_dng(path)
 
@@ -91,23 +94,18 @@ FORMATS = (
     FrameFormat(
         name="headerless .raw and .bin files whose shape and dtype are stated",
         endings=(".raw", ".bin"),
-        recognises=is_headerless,
+        recognises=_is_headerless,
         source=HeaderlessFile,
     ),
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
-    FrameFormat(name="PGM", endings=(".pgm",), source=PgmFile),
-    FrameFormat(name="BMP", endings=(".bmp",), source=BmpFile),
     FrameFormat(name="TIFF stacks", recognises=_is_tiff_stack, source=TiffStack),
     FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=_is_tiff, source=TiffFile),
-    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
         source=CameraRaw,
     ),
-    FrameFormat(name="Photron .mraw with .cihx or .cih", movies=MRAW_ENDINGS, source=MrawFile),
-    FrameFormat(name="NorPix .seq", movies=(".seq",), source=SeqFile),
     FrameFormat(name="stacks in .npy files", movies=(".npy",), source=NpyFile),
     FrameFormat(
         name="stacks in HDF5 files",
@@ -123,9 +121,9 @@ ENTRY_POINTS = "rgbmidic.frame_formats"
 
 
 @cache
-def _plugin_formats() -> tuple[FrameFormat, ...]:
-    """Return the formats of other packages; one that cannot be loaded is left out with a warning."""
-    formats = list[FrameFormat]()
+def _added_formats() -> tuple[FrameFormat, ...]:
+    """Return the formats of tools and of other packages; one that cannot be loaded is left out with a warning."""
+    formats = [frame_format for load in FRAME_FORMATS.values() for frame_format in load()]
     for point in entry_points(group=ENTRY_POINTS):
         try:
             frame_format = point.load()
@@ -149,18 +147,15 @@ def frame_formats() -> tuple[FrameFormat, ...]:
     >>> any(".dng" in frame_format.endings for frame_format in frame_formats())
     True
     """
-    return (*FORMATS, *_plugin_formats())
+    return (*FORMATS, *_added_formats())
 
 
+_MOVIE = "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern"
 _ADVICE = (
     (
         (".mp4", ".avi", ".mov", ".mkv", ".wmv"),
         "a movie whose frames are compressed or demosaiced, so that its samples are no longer the sensor's: give the "
         "camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
-    ),
-    (
-        tuple(ending for frame_format in FORMATS for ending in frame_format.movies),
-        "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern",
     ),
     (
         (".jpg", ".jpeg", ".gif", ".heic", ".webp"),
@@ -176,7 +171,10 @@ _ADVICE = (
 
 def advice(path: Path) -> str:
     """Return what a file is that is no frame, and what to do; empty where that is not known."""
-    return next((text for endings, text in _ADVICE if path.suffix.lower() in endings), "")
+    ending = path.suffix.lower()
+    if any(ending in frame_format.movies for frame_format in frame_formats()):
+        return _MOVIE
+    return next((text for endings, text in _ADVICE if ending in endings), "")
 
 
 class _UnknownFile(FrameSource):

@@ -18,11 +18,10 @@ import numpy as np
 
 from rgbmidic.arguments import checked
 from rgbmidic.disk import write_complete
-from rgbmidic.errors import FrameError, InputError
+from rgbmidic.errors import FrameError, InputError, damaged_file
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.frames.metadata import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size, damaged_file
+from rgbmidic.frames.metadata import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
 _LOG_PREFIX = re.compile(r"^\[ *(ERROR|WARN)\S*\] global \S+ \S+ ")
@@ -109,11 +108,6 @@ def _check_chunks(content: bytes, path: Path) -> None:
         if zlib.crc32(view[start + 4 : end]) != int.from_bytes(view[end : end + 4], "big"):
             raise damaged_file(path, f"the checksum of its {name.decode(errors='replace')} part is wrong")
         start = end + 4
-
-
-def is_headerless(path: Path, user_metadata: FrameSettings) -> bool:
-    """Return whether a file has no header: .bin, and .raw whose shape is stated, as some cameras' .raw have one."""
-    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and user_metadata.shape is not None)
 
 
 class HeaderlessFile(FrameSource):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import FrameError, disk_reason
-from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray, FloatImage
 
 SOFTWARE = 305

@@ -20,7 +20,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, InputError, RgbmidicError, first_line
+from rgbmidic.errors import FrameError, InputError, damaged_file
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, shift_cfa
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, FrameSettings
 from rgbmidic.typing import AnyArray, FloatArray
@@ -39,22 +39,6 @@ in a seventeenth, but empty pictures, which bombs are, in a thousandth.
 
 MAX_FRAMES = 2_000_000
 """Most frames that a header may announce: a camera of 64 GB holds so many of 128x128 pixels of 16 bit."""
-
-
-def damaged_file(path: Path, reason: object) -> FrameError:
-    """Return the error for a file that cannot be read whole."""
-    return FrameError(f"{path} is damaged or truncated: {reason}")
-
-
-@contextmanager
-def library_faults(path: Path, *allowed: type[Exception]) -> Iterator[None]:
-    """Turn what another library raises over a damaged file, in many kinds, into a FrameError; but for `allowed`."""
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, (RgbmidicError, *allowed)):
-            raise
-        raise damaged_file(path, first_line(error)) from None
 
 
 def check_size(path: Path, *, unpacked: int, stored: int) -> None:

@@ -15,7 +15,7 @@ from typing import Self
 from rgbmidic.arguments import checked
 from rgbmidic.errors import FrameError, convert_disk_errors, printable
 from rgbmidic.frames.formats import advice, frame_formats
-from rgbmidic.frames.stacks import split_dataset
+from rgbmidic.frames.source import split_dataset
 
 _INTEGER, _DECIMAL = "[0-9]+", r"[0-9]+(?:[.,][0-9]+)?"
 _RESET = 9999

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from rgbmidic.errors import FrameError, convert_disk_errors, printable
+from rgbmidic.disk import require_regular_file
+from rgbmidic.errors import FrameError, convert_disk_errors, damaged_file, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
+from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, raw_frame
 from rgbmidic.renamed import state_new_names
-from rgbmidic.settings import FrameSettings, require_regular_file
+from rgbmidic.settings import FrameSettings
 
 _T = TypeVar("_T")
 _NOTHING_STATED = Recording()
+_WITH_DATASET = re.compile(r"(.*\.(?:h5|hdf5|nxs)):(.+)", re.IGNORECASE | re.DOTALL)
 
 
 @state_new_names
@@ -57,7 +59,8 @@ class FrameSource(ABC):
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of every frame, from the header alone."""
-        with _require_file(self.path):
+        with convert_disk_errors(FrameError, f"{self.path} cannot be read"):
+            _check_file(self.path)
             return self._shape()
 
     @property
@@ -145,7 +148,8 @@ class FrameSource(ABC):
         """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
-        with _require_file(self.path):
+        with convert_disk_errors(FrameError, f"{self.path} cannot be read"):
+            _check_file(self.path)
             if window is None or window.is_whole:
                 return self._rows(index, slice(None))
             if (shape := self._shape()) != window.frame:
@@ -196,7 +200,8 @@ class MovieSource(FrameSource):
         FrameError
             The file is missing, or its header is damaged.
         """
-        with _require_file(self.path):
+        with convert_disk_errors(FrameError, f"{self.path} cannot be read"):
+            _check_file(self.path)
             return self._header().recording
 
     @property
@@ -229,17 +234,20 @@ class MovieSource(FrameSource):
     def _header(self) -> MovieHeader: ...
 
 
-@contextmanager
-def _require_file(path: Path) -> Iterator[None]:
-    """Check that there is something to read; what the disk refuses becomes a FrameError."""
-    with convert_disk_errors(FrameError, f"{path} cannot be read"):
-        if path.is_symlink() and not path.exists():
-            raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
-        if not require_regular_file(path).is_file():
-            raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
-        if path.stat().st_size == 0:
-            raise damaged_file(path, "it is empty")
-        yield
+def split_dataset(path: Path | str) -> tuple[str, str]:
+    """Split a name into the file and the dataset named behind it: ``run.h5:/entry/data``; empty where none is."""
+    match = _WITH_DATASET.fullmatch(str(path))
+    return (match[1], match[2]) if match else (str(path), "")
+
+
+def _check_file(path: Path) -> None:
+    """Check that there is something to read."""
+    if path.is_symlink() and not path.exists():
+        raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
+    if not require_regular_file(path).is_file():
+        raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
+    if path.stat().st_size == 0:
+        raise damaged_file(path, "it is empty")
 
 
 def cache_by_file(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import itertools
 import math
-import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, first_line, printable
+from rgbmidic.errors import FrameError, damaged_file, first_line, library_faults, printable
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.metadata import (
     MAX_BYTES,
@@ -26,11 +25,9 @@ from rgbmidic.frames.metadata import (
     StoredFrame,
     check_count,
     check_size,
-    damaged_file,
-    library_faults,
     truncated_file,
 )
-from rgbmidic.frames.source import MovieSource, cache_by_file
+from rgbmidic.frames.source import MovieSource, cache_by_file, split_dataset
 
 if TYPE_CHECKING:
     import h5py
@@ -90,14 +87,6 @@ def _npy_header(path: Path) -> EvenFrames:
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")
-
-_WITH_DATASET = re.compile(r"(.*\.(?:h5|hdf5|nxs)):(.+)", re.IGNORECASE | re.DOTALL)
-
-
-def split_dataset(path: Path | str) -> tuple[str, str]:
-    """Split a name into the file and the dataset named behind it: ``run.h5:/entry/data``; empty where none is."""
-    match = _WITH_DATASET.fullmatch(str(path))
-    return (match[1], match[2]) if match else (str(path), "")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,19 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError
+from rgbmidic.disk import require_regular_file
+from rgbmidic.errors import FrameError, damaged_file
 from rgbmidic.frames.data import Integers, Recording
 from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.metadata import (
-    CHECKED_BYTES,
-    EvenFrames,
-    MovieHeader,
-    StoredFrame,
-    check_count,
-    damaged_file,
-    unpack_bits,
-)
+from rgbmidic.frames.metadata import CHECKED_BYTES, EvenFrames, MovieHeader, StoredFrame, check_count, unpack_bits
 from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
 from rgbmidic.frames.tiff_pages import (
     PACKED_BITS,
@@ -40,7 +33,6 @@ from rgbmidic.frames.tiff_pages import (
     open_tiff,
     tag,
 )
-from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:

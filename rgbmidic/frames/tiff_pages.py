@@ -16,9 +16,9 @@ from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
-from rgbmidic.errors import FrameError
-from rgbmidic.frames.metadata import check_size, damaged_file, library_faults
-from rgbmidic.settings import require_regular_file
+from rgbmidic.disk import require_regular_file
+from rgbmidic.errors import FrameError, damaged_file, library_faults
+from rgbmidic.frames.metadata import check_size
 
 if TYPE_CHECKING:
     import tifffile

@@ -16,21 +16,13 @@ from typing import Any, TypeVar, cast
 import numpy.typing as npt
 
 from rgbmidic.arguments import check_fields, checked
-from rgbmidic.disk import write_complete
+from rgbmidic.disk import require_regular_file, write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
-from rgbmidic.settings import (
-    BAYER_PATTERNS,
-    FrameKind,
-    read_section,
-    read_table,
-    require_regular_file,
-    to_plain,
-    unique_keys,
-)
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, read_section, read_table, to_plain, unique_keys
 from rgbmidic.typing import FloatArray
 
 _Section = TypeVar("_Section")

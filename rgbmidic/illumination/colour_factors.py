@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels import texture as kernels
+from rgbmidic._kernels.illumination import common_slopes
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
@@ -471,26 +472,15 @@ def colour_factors(moments: Moments, texture: TextureModel, model: MosaicModel) 
     ColourFactors
     """
     crosstalk, band = model.matrix, texture.band
-    energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
+    energy = np.array([band.adjacent, band.diagonal, band.adjacent])
     channel_variance = moments.variance / band.same
-    sparkle = np.zeros_like(channel_variance)
     # own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause
     allowed = 0.05 * (1 - texture.specific)
-    least_shared = 1e-4 * channel_variance.min(axis=0)
     to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in PAIRS])
-    for _ in range(2):  # the correction is small and settles at once
-        # moments of two channels that come from the sparkle of lights, given each channel's own
-        leaked = np.tensordot(to_pairs, np.maximum(np.tensordot(to_lights, sparkle, axes=1), 0), axes=1)
-        red_green, red_blue, green_blue = np.maximum((moments.covariance - leaked) / energy, least_shared)
-        square = np.stack(
-            [red_green * red_blue / green_blue, red_green * green_blue / red_blue, red_blue * green_blue / red_green]
-        )
-        square = np.minimum(square, channel_variance)
-        excess = channel_variance / square
-        min_excess = excess.min(axis=0)
-        # at least one channel is free of reflections at each place, unless it shows too much of its own for that
-        specific = excess - min_excess + np.maximum(min_excess - 1 - allowed, 0)
-        sparkle = specific * square * band.same
+    sparkle = np.ascontiguousarray(band.same * to_lights)
+    square, specific = np.empty_like(channel_variance), np.empty_like(channel_variance)
+    # what the lights' sparkle adds to the moments of two channels, given each channel's own
+    common_slopes(channel_variance, moments.covariance, energy, allowed, sparkle, to_pairs, square, specific)
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side;
     # the window cannot tell .003 from none
     variance = np.maximum(specific * (band.same / WHITE_ENERGY) - 0.003, 0)

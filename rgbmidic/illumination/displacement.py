@@ -14,14 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
 from rgbmidic.illumination.colour_factors import BLOCK, FAINTEST, ColourFactors, Moments, MosaicModel, upsample_rows
 from rgbmidic.illumination.images import frame_geometry, registration_basis
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.mesh.pixel_map import window_means
+from rgbmidic.typing import BoolArray, FloatArray
 
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
@@ -169,24 +169,18 @@ def light_displacement(
     sums = np.empty((count, 3, *slope.shape[1:]), dtype=np.float32)
     displacement_scores(moments.lights, scale, CELLS, sums)
     blocks = window / BLOCK
-    window_means = np.array(
-        [[_window_sums(grid, blocks) for grid in light_sums] for light_sums in sums], dtype=np.float64
-    )
-    information = window_means[:, 2:] + 1e-12
-    estimate = window_means[:, :2] / information
+    means = window_means(sums, blocks).astype(np.float64)
+    information = means[:, 2:] + 1e-12
+    estimate = means[:, :2] / information
     # by the scatter of the blocks' scores, which are nearly independent
     scatter = ((sums[:, :2] - estimate * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
-    chance = np.array([_window_sums(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
+    chance = window_means(scatter, blocks / np.sqrt(2)) / (4 * np.pi * blocks**2)
     # cells of 2 px; a light against the mean of all, not of the others
     unit = 2 / texture.gradient_gain * (count - 1) / count
     std = unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
     estimate = unit * estimate - _at_rest(moments.red, factors, texture, model)[:, :, None, None]
     # a single light lies at the mean of all, exactly
     return LightDisplacement(values=estimate - estimate.mean(axis=0), std=np.maximum(std, LEAST_STD))
-
-
-def _window_sums(grid: FloatImage, sigma: float) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
 
 
 def _at_rest(red: tuple[int, int], factors: ColourFactors, texture: TextureModel, model: MosaicModel) -> FloatArray:

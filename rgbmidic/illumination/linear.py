@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.illumination import subtract_black
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
@@ -132,13 +133,15 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
     (np.float32(500.0), 4031.0)
     """
     full_scale = frame.white_level - float(frame.black_level.mean())
-    saturated = frame.values >= frame.white_level
+    black = frame.black_level.astype(np.float32)
     if isinstance(frame, ChannelFrame):
-        values = frame.values.astype(np.float32) - frame.black_level.astype(np.float32)[:, None, None]
-        return LinearChannels(values=values, valid=~saturated, full_scale=full_scale)
-    values = frame.values.astype(np.float32)
-    for row, black in enumerate(frame.black_level.astype(np.float32)):
-        values[row::2] -= np.tile(black, -(-values.shape[1] // 2))[: values.shape[1]]
+        values = frame.values.astype(np.float32) - black[:, None, None]
+        return LinearChannels(values=values, valid=frame.values < frame.white_level, full_scale=full_scale)
+    columns = frame.values.shape[1]
+    values, saturated = np.empty(frame.values.shape, np.float32), np.empty(frame.values.shape, bool)
+    black_rows = np.tile(black, -(-columns // 2))[:, :columns]
+    samples = np.ascontiguousarray(frame.values)
+    subtract_black(samples, np.ascontiguousarray(black_rows), frame.white_level, values, saturated)
     return LinearMosaic(values=values, saturated=saturated, cfa=frame.cfa, full_scale=full_scale, noise=noise)
 
 

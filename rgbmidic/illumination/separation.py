@@ -20,14 +20,14 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import (
     SMALLEST_FRAME,
+    FilterTables,
     Reconstruction,
     malvar_demosaic,
     normalised_demosaic,
     reconstruct,
 )
-from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.images import IlluminationImages, Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.prediction_filters import FilterTables
 from rgbmidic.illumination.texture import TextureModel
 
 DEFAULT_METHOD = "reflection-aware"
@@ -86,8 +86,7 @@ def separate(
     if isinstance(calibration, Crosstalk):
         calibration = Calibration(crosstalk=calibration)
     linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
-    images = _separated(linear, calibration, method, texture, None)
-    return replace(images, registration=calibration.registration)
+    return _separated(linear, calibration, method, texture)
 
 
 def _separated(
@@ -95,25 +94,22 @@ def _separated(
     calibration: Calibration,
     method: str,
     texture: TextureModel | None,
-    tables: FilterTables | None,
+    tables: FilterTables | None = None,
 ) -> IlluminationImages:
     """One image per light, each where the lens put it."""
-    crosstalk = calibration.crosstalk
+    crosstalk, registration = calibration.crosstalk, calibration.registration
     if crosstalk is None:
         raise InputError("the calibration has no crosstalk, which colour frames need (rgbmidic-calibrate crosstalk)")
     if isinstance(linear, LinearChannels):
-        return unmix(linear, crosstalk)
+        return replace(unmix(linear, crosstalk), registration=registration)
     method = _resolve_method(method, linear)
     if crosstalk.matrix.shape[0] != 3:
         rows = crosstalk.matrix.shape[0]
         raise InputError(f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {rows} rows")
     if method != DEFAULT_METHOD:
-        return unmix(_BY_CHANNEL[method](linear), crosstalk)
-    mixing = crosstalk.unmixing if crosstalk.field is None else None
-    model = reconstruct(
-        linear, crosstalk, registration=calibration.registration, texture=texture, mixing=mixing, tables=tables
-    )
-    return reconstructed_lights(model, crosstalk, is_mixed=mixing is None)
+        return replace(unmix(_BY_CHANNEL[method](linear), crosstalk), registration=registration)
+    model = reconstruct(linear, crosstalk, registration=registration, texture=texture)
+    return reconstructed_lights(model, crosstalk, registration=registration, tables=tables)
 
 
 @checked
@@ -156,20 +152,27 @@ def demosaic(
         raise InputError(f"demosaicing takes a LinearMosaic, not {type(linear).__name__}")
     if (method_name := _resolve_method(method, linear)) != DEFAULT_METHOD:
         return _BY_CHANNEL[method_name](linear)
-    return reconstruct(linear, crosstalk, texture=texture).channels
+    return reconstruct(linear, crosstalk, texture=texture).predicted()
 
 
-def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, is_mixed: bool = True) -> IlluminationImages:
-    """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels.
+def reconstructed_lights(
+    model: Reconstruction,
+    crosstalk: Crosstalk,
+    *,
+    registration: Registration | None = None,
+    tables: FilterTables | None = None,
+) -> IlluminationImages:
+    """The lights of a frame, and their reflection index, from what the reflection-aware method found out of it.
 
-    The channels are unmixed, unless what the method gives are the lights already. The index, on the blocks' grid, is
-    how much less contrast a light has than the best one.
+    Crosstalk that is the same everywhere is taken off as the lights are predicted, else from the channels predicted.
+    The index, on the blocks' grid, is how much less contrast a light has than the best one.
     """
     height, width = model.factors.slope.shape[1:]
-    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
-    slope, light = (
-        np.tensordot(crosstalk.unmixing, channel_values, axes=1) for channel_values in (model.factors.slope, level)
+    unmixing = crosstalk.unmixing
+    level = np.stack(
+        [cv2.resize(mean, (width, height), interpolation=cv2.INTER_AREA) for mean in model.moments.channel_mean]
     )
+    slope, light = (np.tensordot(unmixing, of_channels, axes=1) for of_channels in (model.factors.slope, level))
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
     relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
@@ -177,16 +180,13 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, is_mixe
         "reflection": 1 - np.clip(relative, 0, 1),
         "displacement": model.displacement,
         "texture": model.texture,
+        "registration": registration,
     }
-    channels = model.channels
-    if is_mixed:
-        return replace(unmix(channels, crosstalk), **diagnostics)
+    if crosstalk.field is not None:
+        return replace(unmix(model.predicted(tables=tables), crosstalk), **diagnostics)
+    lights = model.predicted(unmixing, tables)
     return IlluminationImages(
-        values=channels.values,
-        valid=channels.valid,
-        names=crosstalk.lights,
-        full_scale=channels.full_scale,
-        **diagnostics,
+        values=lights.values, valid=lights.valid, names=crosstalk.lights, full_scale=lights.full_scale, **diagnostics
     )
 
 
@@ -292,17 +292,16 @@ class Separation:
             images = IlluminationImages.in_succession(
                 [channels for channels in linear if isinstance(channels, LinearChannels)], names
             )
-        elif len(linear) > 1:
+            return replace(images, registration=calibration.registration)
+        if len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        elif calibration.crosstalk is None:
+        if calibration.crosstalk is None:
             problem = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(
                 f"{problem}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk; of one white "
                 'light, state frames.kind = "monochrome"'
             )
-        else:
-            images = _separated(linear[0], calibration, self.demosaic, self.texture, self.tables)
-        return replace(images, registration=calibration.registration)
+        return _separated(linear[0], calibration, self.demosaic, self.texture, self.tables)
 
     def within(self, window: Window) -> Separation:
         """The separation of a part of the frames.

@@ -102,10 +102,11 @@ class Recovery:
     @classmethod
     def over(cls, mesh: Tri3Mesh, active: BoolArray, information: FloatArray, first: int | None = None) -> Recovery:
         """Over the elements `active` (E,) of a mesh; `information` (N,) and `first` as in `quadratic_fit`."""
-        offset = mesh.linear_fit_offset
-        operators = quadratic_fit(mesh, active, information=information, offset=offset, first=first)
+        operators = quadratic_fit(mesh, active, information=information, of_linear_fit=True, first=first)
         value, slope_x, slope_y, *curvature = operators
-        return cls(value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature), offset=offset)
+        return cls(
+            value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature), offset=mesh.linear_fit_offset
+        )
 
     @property
     def strain_functionals(self) -> list[Functional]:
@@ -135,7 +136,7 @@ def quadratic_fit(
     active: BoolArray,
     *,
     information: FloatArray | None = None,
-    offset: FloatArray | None = None,
+    of_linear_fit: bool = False,
     first: int | None = None,
 ) -> tuple[sp.csr_matrix, ...]:
     """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
@@ -151,8 +152,8 @@ def quadratic_fit(
         Elements over which nodes are reached.
     information : ndarray, shape (N,), optional
         How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
-    offset : ndarray, shape (N, 3), optional
-        Excess of the given values over a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+    of_linear_fit
+        The nodal values are those of the best linear fit of the field (`Tri3Mesh.linear_fit_offset`), not its own.
     first
         Fit the polynomials of so many first nodes only; None: of all.
 
@@ -161,11 +162,10 @@ def quadratic_fit(
     tuple of csr_matrix, shape (N, N) or (`first`, N)
         In the order of `TERMS`, per px and square px.
     """
-    neighbours, entries, weight, structure = mesh.derive(_window, active.tobytes())
-    basis = mesh.derive(_basis, active.tobytes(), None if offset is None else offset.tobytes())
-    if first is not None:
-        neighbours, weight, basis, structure = neighbours[:first], weight[:first], basis[:first], structure[:first]
-        entries = entries[: structure.nnz]
+    window = mesh.derive(_Window.over) if active.all() else _Window.over(mesh, active)
+    count = len(mesh.nodes) if first is None else first
+    neighbours, weight, structure = window.neighbours[:count], window.weight[:count], window.structure[:count]
+    basis, entries = (window.fitted if of_linear_fit else window.basis)[:count], window.entries[: structure.nnz]
     if information is not None:
         node_information = np.broadcast_to(information[: len(neighbours), None], neighbours.shape)
         neighbour_information = information[neighbours]
@@ -180,9 +180,7 @@ def quadratic_fit(
     # slopes and curvatures are held at 0 where too few nodes determine them: the second derivatives of waves of 5 to 6
     # elements, crack tips among them, change by 2e-5 of the largest at most (measured)
     normal[:, range(1, 6), range(1, 6)] += [1e-9, 1e-9, 1e-6, 1e-6, 1e-6]
-    fits = (
-        np.linalg.inv(normal) / (mesh.sizes[: len(neighbours), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
-    ) @ weighted
+    fits = (np.linalg.inv(normal) / (mesh.sizes[:count, None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[entries]) for term in range(6))
 
 
@@ -221,32 +219,64 @@ def slope_operators(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, s
     return along_x, along_y
 
 
-def _window(mesh: Tri3Mesh, active: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
-    """Return the nodes that the polynomial of each node is fitted to.
+_WIDTH = 0.58
+"""Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
+have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's; with
+.45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45 degrees). At
+an edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times as much as the
+linear fit's, and waves at an edge were seen no better."""
 
-    Returns
-    -------
-    tuple
-        The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
-        weights (N, W); and the matrix of these nodes.
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Window:
+    """The nodes that the polynomial of each node is fitted to.
+
+    Attributes
+    ----------
+    neighbours : ndarray, shape (N, W)
+        The nodes around each; itself where a row has fewer.
+    entries
+        Places of those that are no such filling.
+    weight : ndarray, shape (N, W)
+        Their weights.
+    structure
+        Matrix of these nodes.
+    basis : ndarray, shape (N, 6, W)
+        1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element.
+    fitted : ndarray, shape (N, 6, W)
+        The same of their best linear fits.
     """
-    elements = np.frombuffer(active, dtype=bool)
-    surrounded = angle_fraction(mesh, elements)
-    is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
-    reach = _reached(mesh, elements, ~is_tip)
-    number = np.diff(reach.indptr)
-    is_entry = np.arange(number.max()) < number[:, None]
-    neighbours = np.repeat(np.arange(number.size)[:, None], is_entry.shape[1], axis=1)
-    neighbours[is_entry] = reach.indices
-    square = sum((axis[neighbours] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.sizes[:, None] ** 2
-    # Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
-    # have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's;
-    # with .45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45
-    # degrees). At an edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times
-    # as much as the linear fit's, and waves at an edge were seen no better.
-    width = 0.58
-    weight = np.where(is_entry, np.exp(-square * surrounded[:, None] / (2 * width**2)), 0.0)
-    return neighbours, np.flatnonzero(is_entry), weight, reach
+
+    neighbours: Index
+    entries: Index
+    weight: FloatArray
+    structure: sp.csr_matrix
+    basis: FloatArray
+    fitted: FloatArray
+
+    @classmethod
+    def over(cls, mesh: Tri3Mesh, active: BoolArray | None = None) -> _Window:
+        """Reach nodes over `active` elements (E,), or over all."""
+        elements = np.ones(len(mesh.elements), dtype=bool) if active is None else active
+        surrounded = angle_fraction(mesh, elements)
+        is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
+        reach = _reached(mesh, elements, ~is_tip)
+        number, sizes = np.diff(reach.indptr), mesh.sizes[:, None]
+        is_entry = np.arange(number.max()) < number[:, None]
+        neighbours = np.repeat(np.arange(number.size)[:, None], is_entry.shape[1], axis=1)
+        neighbours[is_entry] = reach.indices
+        x, y = ((axis[neighbours] - axis[:, None]) / sizes for axis in mesh.nodes.T)
+        basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
+        fitted = basis.copy()
+        fitted[:, 3:] += (mesh.linear_fit_offset[neighbours] / sizes[..., None] ** 2).transpose(0, 2, 1)
+        return cls(
+            neighbours=neighbours,
+            entries=np.flatnonzero(is_entry),
+            weight=np.where(is_entry, np.exp(-(x * x + y * y) * surrounded[:, None] / (2 * _WIDTH**2)), 0.0),
+            structure=reach,
+            basis=basis,
+            fitted=fitted,
+        )
 
 
 def angle_fraction(mesh: Tri3Mesh, active: BoolArray) -> FloatArray:
@@ -273,18 +303,6 @@ def at_free_boundary(mesh: Tri3Mesh, active: BoolArray | None = None) -> BoolArr
     at_boundary[sides[is_free]] = True
     at_boundary[opposite[is_near & is_free]] = True
     return at_boundary
-
-
-def _basis(mesh: Tri3Mesh, active: bytes, offset: bytes | None) -> FloatArray:
-    """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
-    neighbours = mesh.derive(_window, active)[0]
-    sizes = mesh.sizes[:, None]
-    x, y = ((axis[neighbours] - axis[:, None]) / sizes for axis in mesh.nodes.T)
-    basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
-    if offset is not None:
-        for term, excess in enumerate(np.frombuffer(offset).reshape(-1, 3).T):
-            basis[:, 3 + term] += excess[neighbours] / sizes**2
-    return basis
 
 
 def _reached(mesh: Tri3Mesh, active: BoolArray, passable: BoolArray) -> sp.csr_matrix:

@@ -5,7 +5,7 @@ from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.run import measure
 from rgbmidic.pipeline.sequence import correlate, measure_sequence
-from rgbmidic.pipeline.source import FrameSequence
+from rgbmidic.pipeline.user_objects import FrameSequence
 
 __all__ = [
     "FrameSequence",

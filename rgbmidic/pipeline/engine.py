@@ -1,16 +1,19 @@
-"""The engine: frames are measured in the order of `rgbmidic.pipeline.plan`, by workers, into a sink.
+"""The engine: frames are measured by workers, each as soon as the frame that it starts from is there, into a sink.
 
-`rgbmidic.measure` runs it with threads or a Dask cluster and a result folder, `rgbmidic.measure_sequence` with the
-latest state alone and a few initial guesses.
+The frames are the leaves of a tree of base `STRIDE`, whatever the number of workers: a frame starts from the one before
+it, every 16th from the 16th before, every 256th from the 256th before, and so on, so that chunks of consecutive frames
+can be measured side by side once their key frame is, and any range of frames needs only some key frames of those before
+it. A key frame that is not measured well from there is measured once more from the frame just before it, and the better
+of both is kept. `rgbmidic.measure` runs it with threads, or workers of a tool, and a result folder,
+`rgbmidic.measure_sequence` with the latest state alone and a few initial guesses.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from heapq import nsmallest
 from typing import Any, Protocol
@@ -19,16 +22,46 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation import NodeStatus, Status, TrackingState
+from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.correlation.solution import rank
-from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, failed_frame, measure_frame_safely
-from rgbmidic.pipeline.order import STRIDE, is_key, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.extensions import WORKERS, load_extension
+from rgbmidic.pipeline.frame import ReferenceHistory, failed_frame, measure_frame_safely
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.warnings import collect_messages
 
 logger = logging.getLogger(__name__)
+
+
+def parent(position: int) -> int | None:
+    """The frame that a frame starts from; None for the first."""
+    if position == 0:
+        return None
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return position - step
+
+
+def is_key(position: int) -> bool:
+    """Return whether a frame starts from one that is not just before it."""
+    return position > 0 and position % STRIDE == 0
+
+
+def dependants(positions: Iterable[int], tries: Sequence[int]) -> set[int]:
+    """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
+
+    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
+    """
+    affected = set(positions)
+    for position, try_count in enumerate(tries):
+        if parent(position) in affected or (try_count > 1 and position - 1 in affected):
+            affected.add(position)
+    return affected
+
+
+Outcome = tuple[FrameRecord, Solution | None]
+"""The record of a frame, and its solution where this process has it."""
 
 
 class Sink(Protocol):
@@ -43,8 +76,26 @@ class Sink(Protocol):
     def updated(self, positions: Sequence[int]) -> ReferenceHistory:
         """Frames that became the reference, or the reference that they make."""
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Take a frame, and the initial guess of those that follow it."""
+
+
+class Workers(Protocol):
+    """Workers measure frames, several at a time: threads of the process, or a tool's."""
+
+    @property
+    def slots(self) -> int:
+        """Number of frames that are measured at a time."""
+
+    def submit(self, position: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[Outcome]:
+        """Have one frame measured."""
+
+    def close(self) -> None:
+        """Let the workers go."""
+
+
+OpenWorkers = Callable[[Plan, str], Workers]
+"""What makes workers of a plan and the address of their scheduler."""
 
 
 class Schedule:
@@ -58,7 +109,7 @@ class Schedule:
         self._plan, self._sink = plan, sink
         self._ready, self._wanted = list[tuple[int, TrackingState]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
-        self._first_tries: dict[int, FrameOutcome] = {}
+        self._first_tries: dict[int, Outcome] = {}
         for position in positions:
             self.want(position)
 
@@ -83,7 +134,7 @@ class Schedule:
             self._waiting.setdefault(before, []).append(position)
             self.want(before)
 
-    def run(self, workers: Threads | Cluster) -> None:
+    def run(self, workers: Workers) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
 
         Raises
@@ -93,17 +144,18 @@ class Schedule:
         FrameError
             All files of the frames are gone.
         """
-        running: dict[Future[FrameOutcome], tuple[int, TrackingState]] = {}
+        running: dict[Future[Outcome], tuple[int, TrackingState]] = {}
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 position, start = self._next(workers.slots)
-                updated = self._sink.updated(start.reference_updates[-1:])  # all that the reference depends on
+                last = start.reference_updates[-1:]  # all that the reference depends on
+                updated = self._sink.updated(last) if last else ()
                 # a key frame looks for what has been lost; frames between key frames follow what there is
                 frame_start = replace(start, unmeasured=0.0) if is_key(position) else start
-                running[workers.submit(self._plan.series.selected[position], frame_start, updated)] = position, start
+                running[workers.submit(position, frame_start, updated)] = position, start
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 position, start = running.pop(future)
-                self._take(position, start, self._outcome(future, self._plan.series.selected[position]))
+                self._take(position, start, self._outcome(future, position))
 
     def _next(self, slots: int) -> tuple[int, TrackingState]:
         """Take the frame that is to be measured next out of those that can be.
@@ -116,36 +168,38 @@ class Schedule:
         self._ready.remove(entry)
         return entry
 
-    def _outcome(self, future: Future[FrameOutcome], index: int) -> FrameOutcome:
+    def _outcome(self, future: Future[Outcome], position: int) -> Outcome:
         """Return the outcome of a worker, or a failed frame with the reason where the worker died."""
         try:
-            outcome = future.result()
+            return future.result()
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
             reason = f"its worker died: {type(error).__name__}"
-            return FrameOutcome(record=failed_frame(self._plan, index, reason))
-        for level, text in outcome.messages:
-            logger.log(level, "%s", text)
-        return outcome
+            return failed_frame(self._plan, position, reason), None
 
-    def _take(self, position: int, start: TrackingState, outcome: FrameOutcome) -> None:
+    def _take(self, position: int, start: TrackingState, outcome: Outcome) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
-        if outcome.record.unread and (gone := self._plan.series.missing_lights()):
+        record, solution = outcome
+        if record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with `resume=True` when they are there again")
         first = self._first_tries.pop(position, None)
-        lost = outcome.record.status != Status.CONVERGED or rank_of(outcome.record)[1] > start.unmeasured + 0.01
-        if first is None and is_key(position) and lost:  # a hundredth of the nodes more than where it started from
+        if first is None and is_key(position) and self._has_lost(record, start):
             self._first_tries[position] = outcome
             self._start_from(position - 1, position)
             return
         if first is not None:
-            better = min(first, outcome, key=lambda item: rank_of(item.record))
-            outcome = replace(better, record=replace(better.record, values={**better.record.values, "tries": 2}))
-        initial_guess = next_start(self._plan, outcome.record.values, start)
-        self._sink.keep(position, outcome, initial_guess)
+            record, solution = min(first, outcome, key=lambda item: rank_of(item[0]))
+            record = replace(record, values={**record.values, "tries": 2})
+        initial_guess = next_start(self._plan, record.values, start)
+        self._sink.keep(position, (record, solution), initial_guess)
         self._wanted.discard(position)
         self._ready += [(item, initial_guess) for item in self._waiting.pop(position, ())]
+
+    @staticmethod
+    def _has_lost(record: FrameRecord, start: TrackingState) -> bool:
+        """Tell whether a frame is not measured well: a hundredth of the nodes more lost than where it started from."""
+        return record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + 0.01
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:
@@ -179,14 +233,14 @@ class Threads:
         self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None
 
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
+    def submit(self, position: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[Outcome]:
         """Have one frame measured, at once where there is one thread."""
         if self._executor is None:
-            done: Future[FrameOutcome] = Future()
-            done.set_result(measure_frame_safely(self._plan, index, start, updated))
+            done: Future[Outcome] = Future()
+            done.set_result(measure_frame_safely(self._plan, position, start, updated))
             return done
         self._count(1)
-        future = self._executor.submit(measure_frame_safely, self._plan, index, start, updated)
+        future = self._executor.submit(measure_frame_safely, self._plan, position, start, updated)
         future.add_done_callback(lambda _: self._count(-1))
         return future
 
@@ -207,77 +261,12 @@ class Threads:
                 cv2.setNumThreads(threads_per_frame)
 
 
-class Cluster:
-    """The workers of a Dask cluster; what a lost one was doing is done again by another."""
-
-    def __init__(self, plan: Plan, address: str) -> None:
-        distributed = import_optional("distributed", "cluster")
-        # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
-        names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
-        self._levels = {log: log.level for log in map(logging.getLogger, names)}
-        for log in self._levels:
-            log.setLevel(logging.CRITICAL + 1)
-        try:
-            self._client = distributed.Client(address, timeout=30, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=120)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ConfigurationError(f"no Dask scheduler with workers answers at {address}: {error}") from None
-        self._plan = self._client.scatter(plan, broadcast=True, hash=False)
-        self._executor = self._client.get_executor(pure=False)
-
-    @property
-    def slots(self) -> int:
-        """Threads of all workers there are now.
-
-        Raises
-        ------
-        RgbmidicError
-            The scheduler does not answer any more.
-        """
-        with _answering():
-            return max(sum(map(int, self._client.nthreads().values())), 1)
-
-    def submit(self, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> Future[FrameOutcome]:
-        """Have one frame measured by some worker."""
-        with _answering():
-            future: Future[FrameOutcome] = self._executor.submit(_measure_on_cluster, self._plan, index, start, updated)
-        return future
-
-    def close(self) -> None:
-        """Leave the cluster to others, without waiting for what is not finished."""
-        self._executor.shutdown(wait=False)
-        alive = self._client.status == "running"
-        with suppress(OSError, RuntimeError, TimeoutError, CancelledError):  # a scheduler that is gone has let go of it
-            self._client.close()
-        if alive:  # else its threads complain for some time yet
-            for log, level in self._levels.items():
-                log.setLevel(level)
-
-
 LOST_CLUSTER = (
     "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with `resume=True`"
 )
+"""What a schedule reports whose workers are gone."""
 
 
-@contextmanager
-def _answering() -> Iterator[None]:
-    """Turn the errors of a scheduler that has gone into one of ours."""
-    try:
-        yield
-    except (OSError, RuntimeError, CancelledError) as error:
-        logger.debug("the Dask scheduler does not answer: %s", error)
-        raise RgbmidicError(LOST_CLUSTER) from None
-
-
-def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Threads | Cluster:
-    """A Dask cluster where its scheduler is named, else `count` threads of this process."""
-    return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
-
-
-def _measure_on_cluster(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory) -> FrameOutcome:
-    """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
-    cv2.setNumThreads(1)
-    set_threads(1)
-    with collect_messages() as messages:
-        outcome = measure_frame_safely(plan, index, start, updated)
-    return FrameOutcome(record=outcome.record, messages=tuple(messages))
+def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
+    """Workers of a cluster where its scheduler is named, else `count` threads of this process."""
+    return Threads(plan, count) if scheduler is None else load_extension(WORKERS, "dask", "scheduler")(plan, scheduler)

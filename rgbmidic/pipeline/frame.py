@@ -1,7 +1,7 @@
 """One frame of a test to one record, whatever the frame is like.
 
-read -> one image per light -> weights -> images of the solve -> displacement and its uncertainty -> gaps filled ->
-brightness of the lights -> record.
+read -> one image per light -> weights -> images of the solve -> displacement -> brightness of the lights -> its
+uncertainty -> gaps filled -> record.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import logging
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ from rgbmidic.correlation import (
     with_one_sided_error,
 )
 from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
@@ -41,40 +40,16 @@ from rgbmidic.pipeline.frame_quality import (
     too_small,
     unsteady,
 )
-from rgbmidic.pipeline.order import STRIDE, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.lamps import LEAST_GAIN, dimmed_lights
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.records import Measurement
 from rgbmidic.timing import record_stages, stage
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import FloatImage
 
 logger = logging.getLogger(__name__)
 
-LEAST_GAIN = 0.3
-"""Light of a lamp over that in the reference, below which the lamp seems to fail; chosen."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameOutcome:
-    """The outcome of a frame: its record, and its solution where this process has it.
-
-    Attributes
-    ----------
-    record
-        What is kept of it.
-    solution
-        Its solution in full; None where it failed, or was measured in another process.
-    messages
-        Level and text of what was logged in another process.
-    """
-
-    record: FrameRecord
-    solution: Solution | None = None
-    messages: tuple[tuple[int, str], ...] = ()
-
-
 ReferenceHistory = Sequence[tuple[int, Solution]] | ReferenceUpdate
-"""Index and solution of the last frame that became the reference, all that it depends on; or the reference."""
+"""Position and solution of the last frame that became the reference, all that it depends on; or the reference."""
 
 
 def measure_frame(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> FrameRecord:
@@ -92,8 +67,8 @@ def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Referen
     start
         From where its displacement is looked for; a frame of the reference starts from rest.
     updated
-        Index and solution of the last of ``start.reference_updates``, all that the reference depends on; or that
-        reference.
+        Position, in the frames chosen, and solution of the last of ``start.reference_updates``, all that the reference
+        depends on; or that reference.
 
     Returns
     -------
@@ -110,22 +85,22 @@ def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Referen
     >>> measure_frame(plan, 1, TrackingState(displacement=None)).status
     0
     """
-    return measure_frame_safely(plan, index, start, updated).record
+    return measure_frame_safely(plan, plan.series.selected.index(index), start, updated)[0]
 
 
-def measure_frame_safely(plan: Plan, index: int, start: TrackingState, updated: ReferenceHistory = ()) -> FrameOutcome:
-    """Measure a frame as `measure_frame`, which gives the record alone."""
+def measure_frame_safely(
+    plan: Plan, position: int, start: TrackingState, updated: ReferenceHistory = ()
+) -> tuple[FrameRecord, Solution | None]:
+    """Measure the frame at a position in those chosen, as `measure_frame`; its solution is returned, too."""
     try:
-        with record_stages(plan.timings) as seconds:
-            measurement = solve_frame(plan, index, start, _reference_of(plan, updated))
-        record = FrameRecord.from_measurement(replace(measurement, seconds=list(seconds.values()) or None))
-        return FrameOutcome(record=record, solution=measurement.solution)
+        return solve_frame(plan, position, start, updated)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
     except Exception as error:  # whatever it is, the other frames can be measured
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
+        index = plan.series.selected[position]
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return FrameOutcome(record=failed_frame(plan, index, reason, unread=unread))
+    return failed_frame(plan, position, reason, unread=unread), None
 
 
 def _reference_of(plan: Plan, updated: ReferenceHistory) -> ReferenceUpdate:
@@ -135,16 +110,16 @@ def _reference_of(plan: Plan, updated: ReferenceHistory) -> ReferenceUpdate:
 
     def make() -> ReferenceUpdate:
         reference_update = ReferenceUpdate.none(plan.reference)
-        for number, solution in updated:
-            reference_update = next_reference(plan, reference_update, number, solution)
+        for position, solution in updated:
+            reference_update = next_reference(plan, reference_update, position, solution)
         return reference_update
 
-    return plan.process.reference_update(tuple(number for number, _ in updated), make)
+    return plan.process.reference_update(tuple(position for position, _ in updated), make)
 
 
-def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
+def failed_frame(plan: Plan, position: int, reason: str, *, unread: bool = False) -> FrameRecord:
     """The record of a frame that could not be measured at all, or even not be read."""
-    time_ns = None
+    index, time_ns = plan.series.selected[position], None
     with suppress(FrameError):  # a movie that is gone tells no times
         time_ns = plan.series.time_ns(index)
     nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
@@ -179,89 +154,97 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         raise _UnreadError(str(error)) from error
 
 
-def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: ReferenceUpdate) -> Measurement:
-    """Measure a frame.
+def solve_frame(
+    plan: Plan, position: int, start: TrackingState, updated: ReferenceHistory
+) -> tuple[FrameRecord, Solution]:
+    """Measure a frame: its record, and its solution in full.
 
     Parameters
     ----------
-    plan, index, start
-        As `measure_frame`.
-    reference_update
-        The reference that ``start.reference_updates`` make.
+    plan, position, start, updated
+        As `measure_frame_safely`.
 
     Raises
     ------
     RgbmidicError
         The frame cannot be read or is not what the settings say.
     """
-    settings, reference = plan.settings, plan.reference
-    position = plan.series.selected.index(index)
+    settings, reference, index = plan.settings, plan.reference, plan.series.selected[position]
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
-    window = plan.window_of(start.displacement, reference_update.displacement)
-    reference_slices = plan.window.slices_in(window)
-    with stage("reading"):
-        state, inputs = read_state(plan, index, window)
-    windowed_state = state
-    if window != plan.window and not isinstance(state, IlluminationImages):
-        windowed_state = tuple(replace(frame, values=frame.values[..., *reference_slices]) for frame in state)
-    warnings = exposure_warnings(plan, windowed_state)
-    with stage("separation"):
-        images = light_images(plan.separation, state, window)
-    if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
-        name = plan.series.name(index)
-        raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
-    with stage("preparation"):
-        grey_levels, weights = plan.prepared(images, index)
-        deformed = Deformed.prepare(grey_levels, weights, prefilter=settings.solver.prefilter, origin=window.origin)
-        step = -(-max(plan.window.shape) // 256)  # of the pictures of weights and reflections, 256 px at most
-        thumbnail = _to_uint8(weights[:, *reference_slices][:, ::step, ::step])
-        del grey_levels, weights  # a tenth of what a frame needs
-    solution = reference_update.track(deformed, start, settings.solver, plan.method)
-    if solution.status is not Status.CONVERGED:
-        causes = [solution.reason, *_causes(plan, windowed_state, images, reference.offset(deformed), solution)]
-        if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
-            causes = [unsteady(plan.reference_motion)]
-        solution = replace(solution, reason="; ".join(causes))
-    if solution.disagreement:
-        warnings.append(solution.disagreement)
-    key = position % STRIDE == 0 or position == len(plan.series.selected) - 1
-    if solution.measured.any():
-        with stage("conclusion"):
-            tracked = solution
-            if settings.mesh.error is True or (settings.mesh.error == "key" and key):
-                solution = discretisation_error(reference, deformed, tracked, settings.solver, plan.method)
-            else:
-                solution = with_one_sided_error(reference.mesh, tracked)
-            if unresolved := unresolved_strain(reference.mesh, tracked, solution):
-                warnings.append(unresolved)
-    filled = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-    displacement = solution.displacement - reference.offset(deformed)
-    brightness = brightness_change(plan.images.values, images.values, reference, displacement)
-    for light, _ in _dimmed_lights(images.names, brightness):
-        warnings.append(f"{light} gives less than {LEAST_GAIN:.0%} of its light in the reference")
-    match, best, becomes_reference = _compare_with_reference(plan, index, start, reference_update, deformed, solution)
-    reference_updates = start.reference_updates
-    if becomes_reference:
-        reference_updates = (*reference_updates, position)
-        warnings.append("becomes the reference of those after it")
-    warnings += _blur_warning(plan, position, start, solution)
-    reflection = images.reflection_index(step, reference_slices)
-    return Measurement(
-        solution=filled,
+    with record_stages(plan.timings) as seconds:
+        reference_update = _reference_of(plan, updated)
+        window = plan.window_of(start.displacement, reference_update.displacement)
+        reference_slices = plan.window.slices_in(window)
+        with stage("reading"):
+            state, inputs = read_state(plan, index, window)
+        windowed_state = state
+        if window != plan.window and not isinstance(state, IlluminationImages):
+            windowed_state = tuple(replace(frame, values=frame.values[..., *reference_slices]) for frame in state)
+        warnings = exposure_warnings(plan, windowed_state)
+        with stage("separation"):
+            images = light_images(plan.separation, state, window)
+        if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
+            name = plan.series.name(index)
+            raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
+        with stage("preparation"):
+            grey_levels, weights = plan.prepared(images, index)
+            deformed = Deformed.prepare(grey_levels, weights, prefilter=settings.solver.prefilter, origin=window.origin)
+            step = -(-max(plan.window.shape) // 256)  # of the pictures of weights and reflections, 256 px at most
+            weights_thumbnail = _to_uint8(weights[:, *reference_slices][:, ::step, ::step])
+            del grey_levels, weights  # a tenth of what a frame needs
+        tracked = reference_update.track(deformed, start, settings.solver, plan.method)
+        has_data = bool(tracked.measured.any())
+        # of a frame without data the lamps are looked at as if it were at rest
+        moved = tracked.displacement if has_data else np.zeros_like(tracked.displacement)
+        brightness = plan.lamps.change(images.values, moved - reference.offset(deformed))
+        dimmed = dimmed_lights(images.names, brightness)
+        if tracked.status is not Status.CONVERGED:
+            tracked = replace(tracked, reason="; ".join(_reasons(plan, windowed_state, dimmed, tracked)))
+        solution = tracked
+        if tracked.disagreement:
+            warnings.append(tracked.disagreement)
+        if has_data:
+            with stage("conclusion"):
+                solution = _with_mesh_error(plan, position, deformed, tracked)
+                if unresolved := unresolved_strain(reference.mesh, tracked, solution):
+                    warnings.append(unresolved)
+            warnings += [
+                f"{light} gives less than {LEAST_GAIN:.0%} of its light in the reference" for light, _ in dimmed
+            ]
+        match, best, becomes_reference = _compare_with_reference(
+            plan, index, start, reference_update, deformed, solution
+        )
+        if becomes_reference:
+            warnings.append("becomes the reference of those after it")
+        warnings += _blur_warning(plan, position, start, solution)
+        reflection, frame_checksum = images.reflection_index(step, reference_slices), checksum(windowed_state)
+        filled = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
+    record = FrameRecord.from_solution(
+        filled,
         number=plan.series.numbers[index],
         time_ns=plan.series.time_ns(index),
         warnings=warnings,
         inputs=inputs,
         machine=machine(),
-        checksum=checksum(windowed_state),
+        checksum=frame_checksum,
         match=match,
         best_match=best,
-        reference_updates=reference_updates,
-        brightness=brightness,
-        weights_thumbnail=thumbnail,
+        reference_updates=(*start.reference_updates, *((position,) if becomes_reference else ())),
+        brightness=brightness if has_data else np.full_like(brightness, np.nan),
+        weights_thumbnail=weights_thumbnail,
         reflection_thumbnail=None if reflection is None else _to_uint8(reflection),
+        seconds=list(seconds.values()) or None,
     )
+    return record, filled
+
+
+def _with_mesh_error(plan: Plan, position: int, deformed: Deformed, tracked: Solution) -> Solution:
+    """Return the solution with the discretisation error that the settings ask for, else that of one side."""
+    is_key_frame = position % STRIDE == 0 or position == len(plan.series.selected) - 1
+    if plan.settings.mesh.error is True or (plan.settings.mesh.error == "key" and is_key_frame):
+        return discretisation_error(plan.reference, deformed, tracked, plan.settings.solver, plan.method)
+    return with_one_sided_error(plan.reference.mesh, tracked)
 
 
 def checksum(state: RawState) -> int:
@@ -270,19 +253,17 @@ def checksum(state: RawState) -> int:
     return zlib.crc32(b"".join(frame.values.tobytes() for frame in samples))
 
 
-def _causes(
-    plan: Plan, state: RawState, images: IlluminationImages, offset: FloatArray, solution: Solution
-) -> list[str]:
-    """Return what may be why a frame did not converge or cannot be measured, and what to change.
+def _reasons(plan: Plan, state: RawState, dimmed: Sequence[tuple[str, float]], solution: Solution) -> list[str]:
+    """Return why a frame did not converge or cannot be measured, what may be the cause, and what to change.
 
-    `state` is cut to the reference's window, which begins at `offset` (x, y) in the `images`' own.
+    `state` is cut to the reference's window; `dimmed` are the lights whose lamp seems to fail.
     """
+    if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
+        return [unsteady(plan.reference_motion)]
     causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
-    displacement = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
-    brightness = brightness_change(plan.images.values, images.values, plan.reference, displacement)
     causes += [
         f"{light} shows the speckle with {gain:.0%} of its contrast in the reference: look at lamp and exposure"
-        for light, gain in _dimmed_lights(images.names, brightness)
+        for light, gain in dimmed
         if not fault
     ]
     if small := too_small(plan.element_size, plan.speckle):
@@ -291,11 +272,11 @@ def _causes(
         causes = [f"larger elements (mesh.element_size, {plan.element_size:g} px) hold such nodes"]
         if solution.iterations >= plan.settings.solver.max_iterations:
             causes = [f"solver.max_iterations is {plan.settings.solver.max_iterations}: allow more, or {causes[0]}"]
-    return causes
+    return [solution.reason, *causes]
 
 
-def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: Solution) -> ReferenceUpdate:
-    """The reference that frame `index` becomes, measured with `solution` on the reference `before`.
+def next_reference(plan: Plan, before: ReferenceUpdate, position: int, solution: Solution) -> ReferenceUpdate:
+    """The reference that the frame at a position becomes, measured with `solution` on the reference `before`.
 
     Raises
     ------
@@ -303,7 +284,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
         The frame cannot be read, or no element of it is measured.
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest_nodes(solution.measured)[1]])
-    return before.updated(solution, *prepared_frame(plan, index, window), window.origin)
+    return before.updated(solution, *prepared_frame(plan, plan.series.selected[position], window), window.origin)
 
 
 def prepared_frame(plan: Plan, index: int, window: Window) -> tuple[FloatImage, FloatImage]:
@@ -330,11 +311,6 @@ def _compare_with_reference(
     return median, 0.0 if is_due else best, is_due
 
 
-def _dimmed_lights(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
-    """The lights whose lamp seems to fail: they give less than `LEAST_GAIN` of their light in the reference."""
-    return [(light, gain) for light, gain in zip(lights, brightness[:, 0], strict=True) if gain < LEAST_GAIN]
-
-
 def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
     """Return what is doubtful about the exposure of a frame that is cut to the reference's window, a text each.
 
@@ -354,7 +330,7 @@ def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
 def _blur_warning(plan: Plan, position: int, start: TrackingState, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
     if (
-        parent(position) != position - 1
+        position % STRIDE == 0  # a key frame
         or start.displacement is None
         or not solution.measured.any()
         or not plan.exposure

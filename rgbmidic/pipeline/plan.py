@@ -20,12 +20,11 @@ from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
-from rgbmidic.extensions import MESH_SOURCES, load_extension
+from rgbmidic.extensions import MESH_SOURCES, PREPARATIONS, load_extension
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST
-from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, without_dark_pixels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import (
@@ -38,9 +37,8 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import MeshLabels, Region, Tri3Mesh
 from rgbmidic.pipeline import frame_quality
-from rgbmidic.pipeline.automatic_threshold import automatic_weights
-from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
-from rgbmidic.pipeline.user_objects import check_user_objects
+from rgbmidic.pipeline.lamps import LampLight
+from rgbmidic.pipeline.user_objects import FrameSequence, Series, check_user_objects, open_frames
 from rgbmidic.results.quantities import MESH_DOCUMENT
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
@@ -49,6 +47,8 @@ from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
 
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 
@@ -125,6 +125,8 @@ class Plan:
         Whether to tell the time that each stage of a frame takes.
     process
         What the threads of a process share.
+    lamps
+        What the light of the lamps is compared with.
 
     Examples
     --------
@@ -156,6 +158,11 @@ class Plan:
     notes: Mapping[str, Any] = field(default_factory=dict)
     timings: bool = False
     process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
+    lamps: LampLight = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Take what the lamps of the frames are compared with."""
+        object.__setattr__(self, "lamps", LampLight.of(self.images.values, self.reference))
 
     @classmethod
     def from_settings(
@@ -232,7 +239,7 @@ class Plan:
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
         if weights is None and (settings.weights.method, settings.weights.threshold) == ("threshold", "auto"):
-            weights = automatic_weights(
+            weights = load_extension(PREPARATIONS, "weights.threshold", "weights.threshold")(
                 settings,
                 images,
                 region,
@@ -376,6 +383,7 @@ def _read_reference(
         window_calibration = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
         # a camera that shakes adds to the difference of two frames: it is not the noise that is calibrated
         repeat = raw[1] if len(raw) > 1 and motion.largest < frame_quality.SUITABILITY.shake else None
+        check_state = load_extension(PREPARATIONS, "calibration.accept", "calibration.file")
         for check in check_state(
             raw[0], window_calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat
         ):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from itertools import chain
@@ -15,17 +15,14 @@ import numpy as np
 from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.errors import FrameError, InputError, ResultError
+from rgbmidic.extensions import PREPARATIONS, load_extension
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
-from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
+from rgbmidic.pipeline.engine import Outcome, Schedule, dependants, next_start, open_workers, rank_of
+from rgbmidic.pipeline.frame import ReferenceHistory, checksum, messages, read_state
 from rgbmidic.pipeline.frame_quality import light_levels
-from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.refinement import refine
-from rgbmidic.pipeline.resolution import choose
-from rgbmidic.pipeline.source import FrameSequence
-from rgbmidic.pipeline.user_objects import check_object, check_type, describe
+from rgbmidic.pipeline.user_objects import FrameSequence, check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
@@ -177,8 +174,8 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(positions)), scheduler)) as pool:
                 schedule.run(pool)
-        table = store.table().iterate(["status", "reason", "warnings"], positions)
-        texts = ((position, messages(record)) for position, record in zip(positions, table, strict=True))
+        table, names = store.table(), ("status", "reason", "warnings")
+        texts = ((position, messages(table.read(position, names))) for position in positions)
         for line in join_frame_warnings(texts, origin.names):
             logger.warning("%s", line)
         with collect_messages() as frame_messages:
@@ -192,7 +189,9 @@ def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: M
     """Make the plan of a test: elements and mesh are those of the `provenance` of a result that is gone on with."""
     sized, notes = settings.mesh, dict[str, Any]()
     if sized.element_size == "auto":
-        choice = notes["element_size"] = provenance.get("element_size") or asdict(choose(settings, **instances))
+        choice = notes["element_size"] = provenance.get("element_size") or asdict(
+            _prepare("mesh.element_size")(settings, **instances)
+        )
         sized = replace(sized, element_size=choice["element_size"])
     refines = settings.mesh.refine is not False
     if refines and instances["mesh"] is not None:
@@ -203,8 +202,13 @@ def _plan_of(settings: TestSettings, instances: Mapping[str, Any], provenance: M
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
         plan, notes["refinement"] = plan.on_mesh(finer), provenance["refinement"]
     elif refines:
-        plan = refine(plan, settings.mesh.refine)
+        plan = _prepare("mesh.refine")(plan, settings.mesh.refine)
     return replace(plan, settings=settings, notes={**plan.notes, **notes})
+
+
+def _prepare(key: str) -> Callable[..., Any]:
+    """Return what finds the value of a key of TEST.toml on the test's own frames."""
+    return load_extension(PREPARATIONS, key, key)
 
 
 class _ResultSink:
@@ -223,29 +227,31 @@ class _ResultSink:
 
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
         """
-        names = ("u", "v", "node_status", "reference_updates", "best_match")
-        for values in self._store.table().iterate(names, range(position, -1, -1)):
+        names, table = ("u", "v", "node_status", "reference_updates", "best_match"), self._store.table()
+        for earlier in range(position, -1, -1):
+            values = table.read(earlier, names)
             if (values["node_status"] == NodeStatus.MEASURED).any():
                 return next_start(self._plan, values, TrackingState(displacement=None))
         return TrackingState(displacement=None)
 
     def updated(self, positions: Sequence[int]) -> ReferenceHistory:
-        """Indices and solutions of the frames that became the reference, as the folder holds them."""
+        """Positions and solutions of the frames that became the reference, as the folder holds them."""
         if not positions:
             return ()
-        mesh, lights, selected = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
         blank, updates = Solution.failed(mesh, lights, "", np.zeros(0)), []
-        names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
-        for position, values in zip(positions, self._store.table().iterate(names, positions), strict=True):
+        names, table = [*chain(*_OF_NODES.values()), "node_status", "rigid"], self._store.table()
+        for position in positions:
+            values = table.read(position, names)
             arrays: dict[str, Any] = {"node_status": values["node_status"], "rigid": values["rigid"].astype(np.float64)}
             for name, columns in _OF_NODES.items():
                 arrays[name] = np.stack([values[column] for column in columns], axis=1, dtype=np.float64)
-            updates.append((selected[position], replace(blank, **arrays)))
+            updates.append((position, replace(blank, **arrays)))
         return updates
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Write a frame, and report what became of it."""
-        record, positions = outcome.record, self._positions
+        record, positions = outcome[0], self._positions
         self._store.write_frame(position, record)
         self._finished[position] = True
         if self._progress is None:
@@ -266,9 +272,10 @@ def _invalidate_frames(plan: Plan, store: ResultStore, names: Sequence[str], *, 
     lost = np.flatnonzero(table.without_damaged(ended="finished" in read_provenance(store.path)).damaged).tolist()
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for position, is_finished in enumerate(table.finished.tolist()):
-        try:
-            values = next(table.iterate(["status", "unread", "tries"], [position] if is_finished else []))
-        except (ResultError, StopIteration):  # damaged, or not there: whatever it was
+        values = dict[str, Any]()
+        with suppress(ResultError):  # damaged, or not there: whatever it was
+            values = table.read(position, ["status", "unread", "tries"]) if is_finished else {}
+        if not values:
             changed.append(position)
             continue
         tries[position] = values["tries"]
@@ -289,7 +296,8 @@ def _invalidate_frames(plan: Plan, store: ResultStore, names: Sequence[str], *, 
 
 def _warn_duplicate_frames(plan: Plan, store: ResultStore, positions: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before or of the reference, bit for bit."""
-    sums = [values["checksum"] for values in store.table().iterate(["checksum"], positions)]
+    table = store.table()
+    sums = [table.read(position, ["checksum"])["checksum"] for position in positions]
     pairs = zip(positions[1:], sums[1:], sums, strict=False)
     repeated = [position for position, crc, before in pairs if crc == before != NO_CHECKSUM]
     selected, references = plan.series.selected, plan.settings.frames.reference

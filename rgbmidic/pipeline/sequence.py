@@ -34,10 +34,9 @@ from rgbmidic.correlation.residual import PrecisionMethod
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, Threads
-from rgbmidic.pipeline.frame import FrameOutcome, messages, next_reference
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.engine import Outcome, Schedule, Threads
+from rgbmidic.pipeline.frame import messages, next_reference
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.pipeline.user_objects import check_object, check_type
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
@@ -342,11 +341,11 @@ class _SequenceSink:
         """The reference that states made, while they were there."""
         return self._updates[tuple(positions)]
 
-    def keep(self, position: int, outcome: FrameOutcome, initial_guess: TrackingState) -> None:
+    def keep(self, position: int, outcome: Outcome, initial_guess: TrackingState) -> None:
         """Take a state's solution, and forget what no later state starts from."""
-        plan, record = self._plan, outcome.record
+        plan, (record, solution) = self._plan, outcome
         mesh, lights = plan.reference.mesh, len(plan.images.names)
-        self.solution = outcome.solution or Solution.failed(mesh, lights, record.reason, np.zeros(0))
+        self.solution = solution or Solution.failed(mesh, lights, record.reason, np.zeros(0))
         checksum = record.values["checksum"]
         if checksum == self._checksum != NO_CHECKSUM:
             logger.warning("state %d repeats the one before, bit for bit", position)
@@ -359,7 +358,7 @@ class _SequenceSink:
             logger.warning("state %d: %s", position, text)
         self._starts[position] = initial_guess
         if (last := initial_guess.reference_updates[-1:]) not in self._updates:
-            self._updates[last] = next_reference(plan, self._updates[()], plan.series.selected[position], self.solution)
+            self._updates[last] = next_reference(plan, self._updates[()], position, self.solution)
         # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
         needed = {position // STRIDE**power * STRIDE**power for power in range(20)}
         self._starts = {item: start for item, start in self._starts.items() if item in needed}

@@ -14,10 +14,10 @@ from typing import Self
 
 import numpy as np
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.alignment import MIN_CORRELATION, MIN_FRAMES, Alignment
-from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)

@@ -60,7 +60,7 @@ class _LazyArray(BackendArray):
 
 
 def _read_stored(result: Result, name: str, frame: int) -> Any:
-    return next(result.iterate(name, [frame]))
+    return result.table.read(frame, [name])[name]
 
 
 def _read_fields(maps: Maps, names: Sequence[str], frame: int) -> AnyArray:

@@ -20,14 +20,15 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import column
 from rgbmidic.fields.quantity import ResultQuantity
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.quantities import MESH_LABELS, QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
+from rgbmidic.text import format_times
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ _SIGN_CHANGING = ("exy", "direction")
 
 
 def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
-    """Write all frames of a result, one after the other: the memory that is needed is that of one frame.
+    """Write the measured frames of a result, one after the other: the memory that is needed is that of one frame.
 
     HDF5 writes through the open file: what the disk refuses is then Python's error. With a file of its own, h5py 3
     crashes where the disk is full.
@@ -59,14 +60,15 @@ def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
     OSError
         The disk is full or refuses.
     """
+    frames = np.flatnonzero(physical.finished)
     sizes = {"node": len(physical.mesh.nodes), "element": len(physical.mesh.elements)}
     sizes["light"] = len(physical.result.lights)
     frame_bytes = sum(entry.unmeasured(sizes).nbytes for entry in physical.columns.values())
     # more than enough: y up has a vector of three numbers, a shear and a direction in single precision; 200 bytes of
     # each frame, node, element and light in what all frames share; what HDF5 writes of the arrays themselves
     frame_bytes += 20 * sizes["node"]
-    shared_bytes = 200 * (len(physical.result) + sum(sizes.values())) + 1_000_000
-    if shutil.disk_usage(Path(file.name).parent).free < frame_bytes * len(physical.result) + shared_bytes:
+    shared_bytes = 200 * (len(frames) + sum(sizes.values())) + 1_000_000
+    if shutil.disk_usage(Path(file.name).parent).free < frame_bytes * len(frames) + shared_bytes:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # before HDF5 itself meets a full disk
     import h5py
 
@@ -77,10 +79,10 @@ def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
         _declare_grid(out.create_group("VTKHDF"), physical)
         arrays, nodes = {name: out[name] for name in physical.columns}, sizes["node"]
         upward_arrays = {name: out[f"VTKHDF/PointData/{name}"] for name in ("displacement", *_SIGN_CHANGING)}
-        for index in range(len(physical.result)):
-            values, rows = physical.frame(index), slice(index * nodes, (index + 1) * nodes)
+        for row, frame in enumerate(frames.tolist()):
+            values, rows = physical.frame(frame), slice(row * nodes, (row + 1) * nodes)
             for name, array in arrays.items():
-                array[index] = values[name]
+                array[row] = values[name]
             for name in _SIGN_CHANGING:
                 upward_arrays[name][rows] = -values[name]
             u, v = values["u"], values["v"]
@@ -91,13 +93,14 @@ def _write_shared(out: h5py.File, physical: ResultInUnits) -> None:
     """Write what all frames have in common: axes, mesh, names and provenance."""
     import h5py
 
-    result, mesh, units, text = physical.result, physical.mesh, physical.units, h5py.string_dtype()
+    frames, result = np.flatnonzero(physical.finished), physical.result
+    mesh, units, text = physical.mesh, physical.units, h5py.string_dtype()
     out.attrs.update({**physical.file_attributes, "axes": _AXES})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     time_description = "time of the frame" if units.timed else "place of the frame, counted from 0"
     (x, y), element = physical.length * mesh.centres.T, ("element",)
     shared: list[tuple[ResultQuantity, AnyArray | None]] = [
-        (ResultQuantity("time", (), units.time, "", time_description), physical.times),
+        (ResultQuantity("time", (), units.time, "", time_description), physical.times[frames]),
         (
             ResultQuantity("node", (), "", "", "index of the node, as in elements"),
             np.arange(len(mesh.nodes), dtype=np.int32),
@@ -105,7 +108,7 @@ def _write_shared(out: h5py.File, physical: ResultInUnits) -> None:
         (ResultQuantity("element", (), "", "", "index of the element"), np.arange(len(mesh.elements), dtype=np.int32)),
         (ResultQuantity("corner", (), "", "", "corner of the element"), np.arange(3, dtype=np.int32)),
         (ResultQuantity("light", (), "", "", "name of the light"), np.array(result.lights, dtype=text)),
-        (ResultQuantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
+        (ResultQuantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)[frames]),
         *physical.coordinates,
         *((SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")),
         (
@@ -141,7 +144,7 @@ def _declare(out: h5py.File, physical: ResultInUnits, entry: ResultQuantity) -> 
     for name, axis in zip(axes, entry.axes, strict=True):
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
             _add(out, ResultQuantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32))
-    shape = (len(physical.result), *(len(out[axis]) for axis in axes))
+    shape = (len(out["time"]), *(len(out[axis]) for axis in axes))
     dataset = _add(out, entry, ("time", *axes), shape=shape, dtype=np.dtype(entry.dtype).newbyteorder("<"))
     if physical.is_strain(entry.name):
         length = f"{physical.gauges.length * physical.length:.6g} {physical.units.length}"
@@ -153,7 +156,8 @@ def _declare_grid(group: h5py.Group, physical: ResultInUnits) -> None:
     """Write the group that VTK's reader looks for: the mesh, the steps, and the nodal quantities."""
     import h5py
 
-    mesh, frames = physical.mesh, len(physical.result)
+    mesh, times = physical.mesh, group.file["time"][...]
+    frames = len(times)
     nodes, elements = len(mesh.nodes), len(mesh.elements)
     group.attrs["Version"] = np.array((2, 0), dtype=np.int64)  # the first with time steps: ParaView 5.12 and later
     group.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
@@ -168,7 +172,7 @@ def _declare_grid(group: h5py.Group, physical: ResultInUnits) -> None:
         group[f"NumberOf{name}"] = np.array([count], dtype=np.int64)
     data, steps, zeros = group.create_group("PointData"), group.create_group("Steps"), np.zeros(frames, dtype=np.int64)
     steps.attrs["NSteps"] = frames
-    steps["Values"] = physical.times
+    steps["Values"] = times
     steps["NumberOfParts"] = zeros + 1
     for name, shape in {"Part": (-1,), "Point": (-1,), "Cell": (-1, 1), "ConnectivityId": (-1, 1)}.items():
         steps[f"{name}Offsets"] = zeros.reshape(shape)
@@ -201,11 +205,11 @@ def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, flip_sign: bool) -
 def export_result(
     result: Result, to: str, out: Path | str, *, scale: ScaleSettings | None = None, overwrite: bool = False
 ) -> None:
-    """Write all frames of a result into one file.
+    """Write the measured frames of a result into one file.
 
-    ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,), of a mesh of ``mesh.file``
-    node_number (N,), element_number (E,) and node_mm (N, 2), and every quantity of
-    `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
+    ``"npz"`` is the store, in px, with all frames, those that are not measured blank: nodes (N, 2), elements (E, 3),
+    names (T,), lights (k,), of a mesh of ``mesh.file`` node_number (N,), element_number (E,) and node_mm (N, 2), and
+    every quantity of `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
     ``"csv"`` and ``"hdf5"`` are for engineers: seconds, millimetres where the scale is known, Green-Lagrange
     strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and a row per node
     and frame with the quantities that are one number per node.
@@ -227,7 +231,7 @@ def export_result(
     Raises
     ------
     InputError
-        The format is unknown, or the file's ending is that of another one.
+        The format is unknown, the file's ending is that of another one, or no frame is measured yet.
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
 
@@ -243,6 +247,8 @@ def export_result(
     if (ending := _ENDINGS.get(out.suffix.lower(), to)) != to:
         raise InputError(f"{out} ends as a file of the format {ending}, and {to} is what is written (`to`): choose one")
     check_file(out, overwrite=overwrite)
+    if not result.finished.any():
+        raise InputError(f"no frame of {result.path} is measured yet")
     physical = ResultInUnits.from_result(result, scale)
     if (exporter := physical.exporter) is not None:
         write_complete(out, lambda file: exporter(to, file))
@@ -282,9 +288,10 @@ def _write_csv(physical: ResultInUnits, file: BinaryIO) -> None:
     head += [column(name, unit) for name, unit in fields.items()]
 
     def rows() -> Iterator[list[object]]:
-        for index, seconds in enumerate(physical.times.tolist()):
+        frames = np.flatnonzero(physical.finished)
+        for index, time in zip(frames.tolist(), format_times(physical.times[frames].tolist()), strict=True):
             values = physical.frame(index)
-            frame_cells = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if has_times else [])]
+            frame_cells = [index, values["number"], result.names[index], *([time] if has_times else [])]
             numbers = np.column_stack(
                 [*(coordinate for _, coordinate in coordinates), *(values[name] for name in fields)]
             )

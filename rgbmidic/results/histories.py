@@ -17,18 +17,18 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import Displacement, Field, FieldSource
 from rgbmidic.fields.history import Probe, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
 from rgbmidic.fields.probes import make_probe
+from rgbmidic.fields.quantity import Units
 from rgbmidic.fields.strain import EQUIVALENT
-from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.text import format_value
+from rgbmidic.text import format_times, format_value
 from rgbmidic.typing import AnyArray, FloatArray, IntArray
 
 
@@ -155,7 +155,7 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
     """Write histories as CSV: a header line whose names carry the units, then one row a frame; empty: no value."""
     columns: dict[str, AnyArray] = {"frame": histories.frames, "number": histories.numbers, "status": histories.status}
     if histories.times is not None:
-        columns["time_s"] = histories.times
+        columns["time_s"] = np.array(format_times(histories.times.tolist()))
     for quantity in histories.quantities:
         columns[quantity.column] = quantity.values
         if quantity.std is not None:
@@ -219,7 +219,7 @@ def read_histories(
         counts[kind] += 1
         probe_list.append(make_probe(source.covariance, kind, counts[kind], position, probes, rectified))
     clock = base.numbers.astype(np.float64) if base.times is None else base.times
-    series, rigid, speed = _read_probes(source, frames, probe_list, probes.rigid_motion, clock)
+    series, rigid, steps = _read_probes(source, frames, probe_list, probes.rigid_motion)
     by_probe = {probe.name: probe.histories(nodal) for probe, nodal in zip(probe_list, series, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
@@ -234,7 +234,7 @@ def read_histories(
     quantities = tuple(
         quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
     )
-    remarks = [*source.remarks, *_remarks(source, base, speed, by_probe)]
+    remarks = [*source.remarks, *_remarks(source, base, steps, by_probe)]
     if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
     if window:
@@ -256,18 +256,17 @@ def empty_histories(source: FieldSource) -> Histories:
 
 
 def _read_probes(
-    source: FieldSource, frames: IntArray, probes: list[Probe], rigid_motion: str, clock: FloatArray
+    source: FieldSource, frames: IntArray, probes: list[Probe], rigid_motion: str
 ) -> tuple[list[Displacement], list[Field], FloatArray]:
-    """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
+    """Read what displacements each probe needs, the rigid motion, and the steps (T,) of fast nodes between frames."""
     of_probes: list[list[Displacement]] = [[] for _ in probes]
     motions = dict[int, RigidMotion]()
-    speed, previous = np.full(len(clock), np.nan), np.full(1, np.nan)
+    steps, previous = np.full(len(frames), np.nan), np.full(1, np.nan)
     for row, frame in enumerate(frames.tolist()):
         displacement = source.displacement(frame)
         step = np.linalg.norm(displacement.values - previous, axis=0)
         if row and np.isfinite(step).any():
-            # of the fast nodes: single outliers do not count
-            speed[row] = np.nanpercentile(step, 95) / (clock[row] - clock[row - 1])
+            steps[row] = np.nanpercentile(step, 95)  # of the fast nodes: single outliers do not count
         previous = displacement.values
         if rigid_motion != "none" and displacement.is_measured.sum() > 1:
             motions[row] = motion = RigidMotion.of(source.covariance, displacement)
@@ -276,14 +275,14 @@ def _read_probes(
             fields.append(displacement.isel(node=probe.nodes))
     histories = []
     for component in zip(*(motion.components for motion in motions.values()), strict=True):
-        values, std = np.full((2, len(clock)), np.nan)
+        values, std = np.full((2, len(frames)), np.nan)
         values[[*motions]], std[[*motions]] = zip(*((one.values, one.uncertainty) for one in component), strict=True)
         history, common = replace(component[0], dims=("frame",), values=values, std=std), component[0].common
         if common is not None:
-            common = np.full((len(common), len(clock)), np.nan)
+            common = np.full((len(common), len(frames)), np.nan)
             common[:, [*motions]] = np.stack([one.common for one in component], axis=1)
         histories.append(replace(history, common=common))
-    return [Displacement.concatenate(fields) for fields in of_probes], histories, speed
+    return [Displacement.concatenate(fields) for fields in of_probes], histories, steps
 
 
 def convert_history(
@@ -390,13 +389,14 @@ def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
 
 
 def _remarks(
-    source: FieldSource, base: Histories, speed: FloatArray, by_probe: Mapping[str, list[Field]]
+    source: FieldSource, base: Histories, steps: FloatArray, by_probe: Mapping[str, list[Field]]
 ) -> Iterator[str]:
     units, frames, exposure = base.units, base.frames, source.exposure
     if not units.timed:
         yield "no time is known: the frame is the unit of time (frame_rate in [scale])"
+    speed = np.full(len(frames), np.nan) if base.times is None else steps / np.diff(base.times, prepend=np.nan)
     blurred = np.nan_to_num(speed) * exposure > 1  # px: the speckle is smeared over a pixel
-    if units.timed and blurred.any():
+    if blurred.any():
         yield (
             f"motion blur: within the exposure of {exposure:g} s the surface moves by up to "
             f"{np.nanmax(speed) * exposure:.3g} px, by more than 1 px in {int(blurred.sum())} frames from "

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from rgbmidic.disk import may_be_alive, read_json, write_errors, write_json
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import may_be_alive, read_json, write_errors, write_json
 
 ALL_FRAMES = range(sys.maxsize)
 """All frames that a folder has or will have."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, Self
 
 import numpy as np
@@ -19,14 +19,13 @@ from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
-from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.quantity import ResultQuantity, Units
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
-from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.renamed import state_new_names
 from rgbmidic.results.quantities import UNKNOWN_TIME, UV, map_quantities
 from rgbmidic.results.result import Portable, Result
-from rgbmidic.results.result_in_units import ResultInUnits, frame_times
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray, IntArray
 
@@ -49,8 +48,6 @@ class Maps(Portable):
 
     Attributes
     ----------
-    result
-        The result.
     physical
         The result in the units of its ``[scale]``, with gauge length and measure of the strain.
     since
@@ -73,7 +70,6 @@ class Maps(Portable):
     True
     """
 
-    result: Result
     physical: ResultInUnits
     since: int | None = None
     rigid_removed: bool = False
@@ -101,7 +97,26 @@ class Maps(Portable):
         InputError
             As of `with_options`.
         """
-        return cls(result=result, physical=result.in_units(scale)).with_options(**choices)
+        return cls(physical=result.in_units(scale)).with_options(**choices)
+
+    @property
+    def result(self) -> Result:
+        """The result."""
+        return self.physical.result
+
+    def refreshed(self, result: Result) -> Self:
+        """Return the fields of the result with the frames that a run has added since.
+
+        Parameters
+        ----------
+        result
+            The result as it is now, `Result.refresh`.
+
+        Returns
+        -------
+        Maps
+        """
+        return replace(self, physical=self.physical.refreshed(result))
 
     def with_options(
         self,
@@ -143,7 +158,7 @@ class Maps(Portable):
         rate_frames(window, FEWEST)
         physical, measure = self.physical, measure or MEASURES[0]
         if (gauge, measure) != (physical.gauge, physical.measure):
-            physical = replace(physical, gauge=gauge, measure=measure)
+            physical = physical.with_strain(gauge, measure)
             strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), measure)
             _ = gauge is not None and physical.gauges
         return replace(self, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
@@ -232,13 +247,8 @@ class Maps(Portable):
         elif entry.group in ("Displacement", "Rates"):
             field = self._derived(entry, frame)
         else:
-            field = self._current.field(name, frame)
+            field = self.physical.field(name, frame)
         return replace(field, std=field.uncertainty)
-
-    @property
-    def _current(self) -> ResultInUnits:
-        """The result in units with all its frames; `physical` may be of an earlier state."""
-        return self.physical if self.physical.result is self.result else replace(self.physical, result=self.result)
 
     def deformed_nodes(self, frame: int) -> FloatArray:
         """Compute the deformed places of the nodes, px of the image; NaN where not measured.
@@ -252,31 +262,31 @@ class Maps(Portable):
         -------
         ndarray, shape (N, 2)
         """
-        record = next(self.result.table.iterate(UV, [frame]))
+        record = self.result.table.read(frame, UV)
         return np.asarray(self.result.nodes + np.stack([record[name] for name in UV], axis=1))
 
     def _derived(self, entry: ResultQuantity, frame: int) -> Field:
         """Compute a displacement or a rate in the reader's units."""
-        source, names, covariance = self._current, entry.base_quantities, None
-        is_vector = {*names} <= {*source.components}
-        calibration = self._covariance.calibration if is_vector else None
+        source, names, covariance = self.physical, entry.base_quantities, None
+        calibration = self._covariance.calibration if {*names} <= {*source.components} else None
         if entry.order:
-            needed = names if calibration is None else source.components
-            by_name = {name: self._rates(name, frame, entry.order) for name in needed}
+            component: Callable[[str], Field] = partial(self._rates, frame=frame, order=entry.order)
         else:
             displacement = self.displacement(frame)
-            by_name, covariance = {one.name: one for one in displacement.components}, displacement.covariance
-        field = by_name[names[0]]
+            component = {one.name: one for one in displacement.components}.__getitem__
+            covariance = displacement.covariance
+        field = component(names[0])
         if len(names) > 1:
+            fields = [component(name) for name in names]
             vector, error = (
                 np.stack(arrays, axis=1)
-                for arrays in zip(*((by_name[name].values, by_name[name].uncertainty) for name in names), strict=True)
+                for arrays in zip(*((one.values, one.uncertainty) for one in fields), strict=True)
             )
             matrix = error[:, :, None] ** 2 * np.eye(len(names))
             length, std = length_of(vector, matrix if covariance is None else np.moveaxis(covariance, 2, 0))
             field = replace(field, values=length, std=std, bias=None)
         if calibration is not None:  # of a length its slope by the components
-            vector = np.stack([by_name[name].values for name in source.components])
+            vector = np.stack([component(name).values for name in source.components])
             errors, rows = calibration.at_nodes(vector), [source.components.index(name) for name in names]
             slope = vector[rows] / np.maximum(np.linalg.norm(vector[rows], axis=0), np.finfo(float).tiny)
             field = field.with_common(
@@ -378,32 +388,28 @@ class Maps(Portable):
 
     def _relative_displacement(self, frame: int) -> Displacement:
         """Return the displacement since the frame that is the reference here."""
-        displacement = self._current.displacement(frame)
+        displacement = self.physical.displacement(frame)
         if self.since is None:
             return displacement
         return displacement.since(self._base_displacement, self._shared_fraction(frame))
 
     @cached_property
     def _base_displacement(self) -> Displacement:
-        return self._current.displacement(self.since or 0)
+        return self.physical.displacement(self.since or 0)
 
     def _shared_fraction(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
         if frame == self.since:
             return 1.0
-        references = self._current.references[[frame, self.since or 0]]
-        return float(frame_covariance(np.ones(2), self._current.common_fraction, references)[0, 1])
+        references = self.physical.references[[frame, self.since or 0]]
+        return float(frame_covariance(np.ones(2), self.physical.common_fraction, references)[0, 1])
 
     @cached_property
     def _covariance(self) -> NodalCovariance:
         """Correlation of the nodes' errors, with the nodes where they are at the reference."""
         if self.since is None:
             return self.physical.covariance
-        deformed = self.physical.points + np.nan_to_num(self._base_displacement.values.T)
-        if deformed.shape[1] > 2:
-            return replace(self.physical.covariance, surface=deformed)
-        mesh = Tri3Mesh(nodes=deformed, elements=self.physical.mesh.elements)
-        return replace(self.physical.covariance, mesh=mesh)
+        return self.physical.covariance.moved(self._base_displacement)
 
     def _rigid(self, displacement: Displacement) -> RigidMotion | None:
         """Fit the rigid motion that is removed; None where none is, or fewer than two nodes are measured."""
@@ -416,7 +422,7 @@ class Maps(Portable):
         return lru_cache(2)(lambda frame: self._strain_of(frame, self.physical.gauges))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        displacement = self._current.displacement(frame)
+        displacement = self.physical.displacement(frame)
         if self.since is None:
             gradient, covariance = gauges.gradient(displacement)
         else:  # both gradients of the same nodes, which have data in both frames
@@ -428,9 +434,8 @@ class Maps(Portable):
             shared = gauges.shared_covariance(present, base, self._shared_fraction(frame))
             gradient, covariance = _relative_gradient(gauges.gradient(present), gauges.gradient(base), shared)
         motion = self._rigid(self._relative_displacement(frame))
-        if motion is not None and len(motion.back) == 2:  # in the tangent plane nothing turns
-            wide = np.kron(motion.back, np.eye(2))
-            gradient, covariance = motion.back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
+        if motion is not None:
+            gradient, covariance = motion.removed_gradient(gradient, covariance)
         return strain_of_gradient(gradient, covariance, self.physical.measure)
 
     def _rates(self, name: str, frame: int, order: int) -> Field:
@@ -450,16 +455,18 @@ class Maps(Portable):
     def _units(self) -> Units:
         """Units with that of time, for which one frame is read: `_clock` reads all."""
         first_stamp = next(iter(self.result.iterate("time_ns", self._measured_frames[:1])), UNKNOWN_TIME)
-        scale = self.physical.scale or self.result.section(ScaleSettings)
+        scale = self.physical.scale or self.result.scale
         rate = scale.frame_rate or self.result.provenance.get("frame_rate")
         return replace(self.physical.units, timed=bool(rate) or first_stamp != UNKNOWN_TIME)
 
     @cached_property
     def _clock(self) -> FloatArray:
         """Times of the frames that are measured, or their numbers where no time is known."""
-        times = frame_times(self.result, self.physical.scale)
+        times = self.physical.seconds
         if times is None and self._units.timed:
-            raise InputError("rates need the times of all frames, of which some have none: state frame_rate in [scale]")
+            raise InputError(
+                "rates need a time of each frame that is later than the one before: state frame_rate in [scale]"
+            )
         clock = self.result.number if times is None else times
         return np.asarray(clock[self._measured_frames], dtype=np.float64)
 
@@ -478,7 +485,7 @@ class Maps(Portable):
         maps = replace(self, since=None, rigid_removed=False)
         if name in self.physical.components:  # as they are, in px: the scale has no noise
             index = self.physical.components.index(name)
-            fields = [self._current.displacement(frame).components[index] for frame in frames.tolist()]
+            fields = [self.physical.displacement(frame).components[index] for frame in frames.tolist()]
         else:
             fields = [maps.read(name, frame) for frame in frames.tolist()]
         series, rows = (
@@ -487,8 +494,8 @@ class Maps(Portable):
         )
         options: dict[str, Any] = {
             "window": (window_frames - 1) * float(np.median(np.diff(self._clock))),
-            "common_fraction": self._current.common_fraction,
-            "references": self._current.references[frames],
+            "common_fraction": self.physical.common_fraction,
+            "references": self.physical.references[frames],
         }
         starts = range(0, len(self.result.nodes), _NODES_PER_BATCH)
         parts = [rates(clock, series.isel(node=slice(start, start + _NODES_PER_BATCH)), **options) for start in starts]

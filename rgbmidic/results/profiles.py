@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete, write_table
 from rgbmidic.errors import InputError
 from rgbmidic.field import Field, column
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.history import rate_correlation
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.result_in_units import frame_times
+from rgbmidic.text import format_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -108,7 +108,7 @@ class Profile:
         self.line = ProfileLine(
             physical.covariance, physical.gauges, *physical.rectified.probe_coordinates(endpoints, 2)
         )
-        times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
+        times, self.numbers = physical.seconds, physical.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
         self.data = Field(
@@ -155,16 +155,15 @@ class Profile:
     @property
     def positions(self) -> FloatArray:
         """Distance (P,) of the points from the first end, in the unit of lengths."""
-        return self.line.positions * self._scale
+        return self._in_units(self.line.positions)
 
     @property
     def places(self) -> FloatArray:
         """Places (P, 2) of the points on the reference, or (P, 3) in space, in the unit of lengths."""
-        return self._scale * (self.line.points if self.line.surface is None else self.line.surface)
+        return self._in_units(self.line.coordinates)
 
-    @property
-    def _scale(self) -> float:
-        return (self.units.mm_per_pixel or 1.0) if self.line.surface is None else 1.0
+    def _in_units(self, lengths: FloatArray) -> FloatArray:
+        return self.units.convert(Field(name="", unit=self.line.unit, values=lengths)).values
 
     @property
     def clock(self) -> FloatArray:
@@ -287,8 +286,9 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:
-        for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
-            cells = [frame, number, *([f"{clock:.12g}"] if time_columns else [])]
+        clock = format_times(profile.clock.tolist())
+        for row, (frame, number, time) in enumerate(zip(profile.frames, profile.numbers, clock, strict=True)):
+            cells = [frame, number, *([time] if time_columns else [])]
             for numbers in np.column_stack([positions, profile.values[row], profile.std[row]]).tolist():
                 yield [*cells, *numbers]
 

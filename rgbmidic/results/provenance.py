@@ -18,12 +18,12 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.threads import machine
 from rgbmidic._version import __version__
+from rgbmidic.disk import read_json
 from rgbmidic.errors import AnotherTestError, ResultError
 from rgbmidic.extensions import RESULTS
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
 from rgbmidic.mesh import MeshLabels
-from rgbmidic.results.files import read_json
 from rgbmidic.results.quantities import MESH_DOCUMENT, MESH_LABELS, SHARED
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray

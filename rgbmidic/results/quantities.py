@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.fields.quantity import ESTIMATED, ResultQuantity, with_uncertainty
+from rgbmidic.fields.quantity import ESTIMATED, ResultQuantity, Units, with_uncertainty
 from rgbmidic.fields.strain import PRINCIPAL, STRAIN, TENSOR
-from rgbmidic.fields.units import Units
 from rgbmidic.timing import STAGES
 
 NO_CHECKSUM = -1
@@ -112,6 +111,8 @@ _TABLE = (
 
 QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
+NUMBERS = tuple(name for name, quantity in QUANTITIES.items() if not quantity.axes and quantity.is_stackable)
+"""Those that are one number a frame: they are read together."""
 FAILED = QUANTITIES["status"].codes.index("failed")
 """`status` of a frame that could not be measured."""
 

@@ -16,23 +16,22 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
-from functools import cache, lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from rgbmidic.disk import npy_array, npy_bytes, require_regular_file, write_complete
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
-from rgbmidic.settings import require_regular_file
 from rgbmidic.text import HtmlRepr
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
+from rgbmidic.typing import BoolArray, IntArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -79,36 +78,6 @@ class QuantityAttributes:
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measurement:
-    """A solved frame: its solution, and the quantities without a `ResultQuantity.source` by their names.
-
-    Attributes
-    ----------
-    solution
-        Displacement and all that the solve gives.
-    number, time_ns, brightness, match, best_match, reference_updates, weights_thumbnail, reflection_thumbnail, seconds
-        See `QUANTITIES`; None where not known.
-    inputs
-        SHA-256 of each file that the frame was read from, by its path.
-    """
-
-    solution: Solution
-    number: int
-    time_ns: int | None
-    warnings: Sequence[str]
-    inputs: Mapping[str, str]
-    machine: str
-    checksum: int
-    match: float
-    best_match: float
-    reference_updates: Sequence[int]
-    brightness: FloatArray
-    weights_thumbnail: AnyArray
-    reflection_thumbnail: AnyArray | None
-    seconds: Sequence[float] | None = None
 
 
 @state_new_names
@@ -169,26 +138,26 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
         return cls(values=blank | quantities, sizes=sizes)
 
     @classmethod
-    def from_measurement(cls, measurement: Measurement) -> FrameRecord:
+    def from_solution(cls, solution: Solution, **quantities: Any) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
-        measurement
-            Its solution, from which the quantities that have a `ResultQuantity.source` are taken, and the others.
+        solution
+            From which the quantities that have a `ResultQuantity.source` are taken.
+        **quantities
+            The others, as in `from_values`.
 
         Returns
         -------
         FrameRecord
         """
-        values = {field.name: getattr(measurement, field.name) for field in fields(measurement)}
-        solution: Solution = values.pop("solution")
         nodes, lights = np.shape(solution.light_fraction)
         has_error = np.isfinite(solution.displacement_error).any()
         for entry in QUANTITIES.values():
             if entry.source and (has_error or not entry.is_estimated):
-                values[entry.name] = entry.read_from(solution)
-        return cls.from_values(nodes=nodes, lights=lights, **values)
+                quantities[entry.name] = entry.read_from(solution)
+        return cls.from_values(nodes=nodes, lights=lights, **quantities)
 
     @classmethod
     def failed(cls, reason: str, *, nodes: int, lights: int, **quantities: Any) -> FrameRecord:
@@ -370,46 +339,43 @@ class FrameTable:
         damaged = ~self.finished & ended
         for frame in np.flatnonzero(self.finished).tolist():
             try:
-                next(self.iterate(None, [frame]))
+                self.read(frame)
             except AnotherTestError:
                 raise
             except ResultError:
                 damaged[frame] = True
         return replace(self, damaged=damaged)
 
-    def iterate(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
-        """Read some quantities of one frame after the other.
+    def read(self, frame: int, names: Iterable[str] = QUANTITIES) -> dict[str, Any]:
+        """Read some quantities of a frame, all unless stated; those of a frame that is not there are blank.
 
         Parameters
         ----------
+        frame
+            Its index.
         names
-            The quantities; None: all.
-        frames
-            Their indices, in any order.
+            The quantities.
 
-        Yields
-        ------
+        Returns
+        -------
         dict
-            The quantities of a frame by name.
+            The quantities by name.
 
         Raises
         ------
         ResultError
-            A record is damaged, or of another run; the message names file and frame.
+            The record is damaged, or of another run; the message names file and frame.
         """
-        selection, finished = tuple(QUANTITIES if names is None else names), self.finished
-        blank = cache(partial(FrameRecord.failed, nodes=self.sizes["node"], lights=self.sizes["light"]))
-        for frame in frames:
-            if not finished[frame]:
-                values = blank(_DAMAGED if self.damaged[frame] else _NOT_YET).values
-                yield {name: values[name] for name in selection}
-                continue
-            file = record_file(self.folder, frame)
-            try:
-                yield _read_record(file, frame, selection, self.run)
-            except OSError as error:
-                raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
-            except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
-                raise
-            except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
-                raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None
+        if self.write_times[frame] < 0 or self.damaged[frame]:
+            reason = _DAMAGED if self.damaged[frame] else _NOT_YET
+            blank = {name: QUANTITIES[name].unmeasured(self.sizes) for name in names} | {"reason": reason}
+            return {name: QUANTITIES[name].convert(blank[name], self.sizes) for name in names}
+        file = record_file(self.folder, frame)
+        try:
+            return _read_record(file, frame, names, self.run)
+        except OSError as error:
+            raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
+        except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
+            raise
+        except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
+            raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import read_arrays, read_json, write_json
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.extensions import RESULTS
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import (
     PROVENANCE,
     RESTORE_REMEDY,
@@ -27,10 +27,10 @@ from rgbmidic.results.provenance import (
     read_provenance,
     with_checksum,
 )
-from rgbmidic.results.quantities import MESH_DOCUMENT, MESH_LABELS, QUANTITIES, SHARED
+from rgbmidic.results.quantities import MESH_DOCUMENT, MESH_LABELS, NUMBERS, QUANTITIES, SHARED
 from rgbmidic.results.records import FrameRecord, FrameTable, QuantityAttributes
 from rgbmidic.results.warnings import join_frame_warnings
-from rgbmidic.settings import read_section
+from rgbmidic.settings import ScaleSettings, read_section
 from rgbmidic.settings.schema import section_types
 from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from rgbmidic.results.result_in_units import ResultInUnits
-    from rgbmidic.settings import ScaleSettings
 
 S = TypeVar("S")
 
@@ -254,6 +253,11 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         name = names[section_type]
         return read_section(section_type, name, self.provenance.get("settings", {}).get(name, {}))
 
+    @cached_property
+    def scale(self) -> ScaleSettings:
+        """``[scale]`` of the settings that it was measured with."""
+        return self.section(ScaleSettings)
+
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """Return a setting of the run, as TEST.toml names it; `default` where it was not kept.
 
@@ -291,7 +295,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         """
         if not isinstance(index, int | np.integer) or not -len(self) <= index < len(self):
             raise InputError(f"there is no frame {index!r} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        values = next(self.table.iterate(None, [int(index) % len(self)]))
+        values = self.table.read(int(index) % len(self))
         return FrameRecord(values=values, sizes=self.table.sizes)
 
     @checked
@@ -310,7 +314,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         Any
         """
         indices = range(len(self)) if frames is None else frames
-        return (values[name] for values in self.table.iterate([name], indices))
+        return (self.table.read(frame, [name])[name] for frame in indices)
 
     @checked
     def stack(self, name: str) -> AnyArray:
@@ -325,12 +329,20 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         -------
         ndarray, shape (T, ...)
         """
-        entry = QUANTITIES[name]
-        shape = (len(self.nodes),) if entry.is_estimated else entry.unmeasured(self.table.sizes).shape
-        stacked = np.full((len(self), *shape), entry.blank, dtype=entry.dtype)
-        for index, value in enumerate(self.iterate(name)):
-            if np.size(value) or not entry.is_estimated:
-                stacked[index] = value
+        return self._stacked([name])[name]
+
+    def _stacked(self, names: Sequence[str]) -> dict[str, AnyArray]:
+        """Read some quantities of all frames, each frame once."""
+        stacked, count = dict[str, AnyArray](), len(self)
+        for name in names:
+            entry = QUANTITIES[name]
+            shape = (len(self.nodes),) if entry.is_estimated else entry.unmeasured(self.table.sizes).shape
+            stacked[name] = np.full((count, *shape), entry.blank, dtype=entry.dtype)
+        for frame in range(count):
+            values = self.table.read(frame, names)
+            for name, array in stacked.items():
+                if np.size(values[name]) or not QUANTITIES[name].is_estimated:
+                    array[frame] = values[name]
         return stacked
 
     def in_units(self, scale: ScaleSettings | None = None) -> ResultInUnits:
@@ -384,8 +396,9 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         return dataset
 
     def _quantity(self, name: str, /) -> AnyArray:
-        stacked = self.__dict__[name] = self.stack(name)
-        return stacked
+        self.__dict__.update(self._stacked([name] if QUANTITIES[name].axes else NUMBERS))
+        quantity: AnyArray = self.__dict__[name]
+        return quantity
 
     @property
     def nodal_strain(self) -> FloatArray:
@@ -418,7 +431,8 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
     def mean_light_fraction(self) -> FloatArray:
         """Mean of `light_fraction` over the measured nodes, shape (T, k); NaN where none is measured."""
         fractions = np.full((len(self), len(self.lights)), np.nan)
-        for row, values in enumerate(self.table.iterate(["light_fraction", "node_status"], range(len(self)))):
+        for row in range(len(self)):
+            values = self.table.read(row, ["light_fraction", "node_status"])
             if (is_measured := values["node_status"] == 0).any():
                 fractions[row] = values["light_fraction"][is_measured].mean(axis=0, dtype=np.float64)
         return fractions

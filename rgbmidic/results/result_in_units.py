@@ -8,7 +8,7 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -17,22 +17,24 @@ from typing import Any, BinaryIO, ClassVar, Literal, Self
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.errors import InputError
 from rgbmidic.extensions import MESH_SOURCES, load_extension
 from rgbmidic.field import Displacement, Field
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
-from rgbmidic.fields.quantity import ResultQuantity
+from rgbmidic.fields.quantity import ResultQuantity, Units
 from rgbmidic.fields.strain import MEASURES, STRAIN, TENSOR, StrainGauges, unchecked_strain
-from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.quantities import (
     DERIVED,
     ELEMENT_STRAIN,
     ERROR_QUANTITIES,
+    FAILED,
     MESH_DOCUMENT,
     QUANTITIES,
     STRAIN_COLUMNS,
     UNKNOWN_TIME,
+    UV,
     stored_map_quantities,
 )
 from rgbmidic.results.result import Portable, Result
@@ -64,44 +66,75 @@ def rectification_of(
     CalibrationError
         The camera's file is not usable, or was made with frames of another shape.
     InputError
-        The camera holds no plane.
+        The camera holds no plane, or a scale is stated beside that of a mesh of ``mesh.file``.
     """
-    effective_scale, camera = result.section(ScaleSettings) if scale is None else scale, None
-    effective_scale = replace(effective_scale, unit=unit or effective_scale.unit)
-    if effective_scale.unit == "px":
-        effective_scale = replace(effective_scale, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
+    stated, camera = result.scale if scale is None else scale, None
+    units = Units(mm_per_pixel=stated.mm_per_pixel, mm_per_pixel_std=stated.mm_per_pixel_std)
+    if (unit or stated.unit) == "px":
+        units = Units()
     elif scale is None:
         camera = stored_camera(result)
     elif scale.camera is not None:
         camera = CameraCalibration.read(scale.camera)
+    document = result.provenance.get(MESH_DOCUMENT)
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    elif (
-        effective_scale.unit == "mm"
-        and effective_scale.mm_per_pixel is None
-        and "camera" not in result.provenance
-        and (document := result.provenance.get(MESH_DOCUMENT)) is not None
-    ):
+    elif document is not None and units.mm_per_pixel is not None:
+        raise InputError(
+            f"scale.mm_per_pixel ({units.mm_per_pixel:g}) states a scale, the mesh of {result.path} has another, that "
+            "of mesh.file: leave it out"
+        )
+    elif document is not None and (unit or stated.unit) == "mm" and "camera" not in result.provenance:
         mm_per_pixel, std = load_extension(MESH_SOURCES, MESH_DOCUMENT, "the mesh of the result").scale(document)
-        effective_scale = replace(effective_scale, mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
-    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), effective_scale, camera)
+        units = Units(mm_per_pixel=mm_per_pixel, mm_per_pixel_std=std)
+    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), units, camera)
 
 
 def stored_camera(result: Result) -> CameraCalibration | None:
     """Return the camera that the ``[scale]`` of a result names, as its provenance holds it; None: none."""
     document = result.provenance.get("camera")
-    return (
-        None
-        if document is None
-        else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
-    )
+    return None if document is None else CameraCalibration.from_document(document, str(result.scale.camera))
+
+
+def _stamped_times(result: Result) -> FloatArray:
+    """Return the time of each measured frame (n,) in s by its time stamp; NaN where it has none.
+
+    That of a frame that could not be measured, such as one that could not be read, follows from its number.
+    """
+    stamps, number = result.time_ns[result.finished], result.number[result.finished].astype(np.float64)
+    stamped = stamps != UNKNOWN_TIME
+    seconds = np.where(stamped, stamps * 1e-9, np.nan)
+    if stamped.sum() > 1:
+        first, *_, last = number[stamped]
+        lost = ~stamped & (result.status[result.finished] == FAILED)
+        interval = np.median(np.diff(seconds[stamped]) / np.maximum(np.diff(number[stamped]), 1))
+        seconds[lost] = np.interp(number[lost], number[stamped], seconds[stamped])
+        seconds[lost] += interval * (number[lost] - np.clip(number[lost], first, last))
+    return seconds
+
+
+def _rises(seconds: FloatArray) -> bool:
+    """Report whether all times are known, and each is later than the one before."""
+    return bool(np.isfinite(seconds).all() and (np.diff(seconds) > 0).all())
+
+
+def frame_rate(result: Result, scale: ScaleSettings | None = None) -> tuple[float | None, str]:
+    """Return the frame rate of a test and where it is from: that of ``[scale]`` before the camera's.
+
+    Frames that have time stamps do not follow the ``[scale]``.
+    """
+    stated, recorded = (scale or result.scale).frame_rate, result.provenance.get("frame_rate")
+    if stated is not None and not _rises(_stamped_times(result)):
+        return stated, "as stated"
+    return recorded, "by the camera's file" if recorded else ""
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
     """Find the time of each frame.
 
-    Time stamps count where the files have one of every frame, from the trigger where the camera reports it; else the
-    time is the number of the frame over `frame_rate`, that of ``[scale]`` before the camera's.
+    Time stamps count where the files have one of every frame that could be measured, and each is later than the one
+    before, from the trigger where the camera reports it; else the time is the number of the frame over `frame_rate`,
+    that of ``[scale]`` before the camera's.
 
     Parameters
     ----------
@@ -120,19 +153,27 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     >>> frame_times(Result.open("my_result"), ScaleSettings(frame_rate=100.0))[:2].tolist()
     [0.0, 0.01]
     """
-    scale = result.section(ScaleSettings) if scale is None else scale
-    finished = result.finished
-    stamps, numbers = result.time_ns[finished], result.number[finished]
-    if (stamps == UNKNOWN_TIME).any():
-        recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
-        rate = scale.frame_rate or recorded
-        seconds = numbers / rate if rate else None
+    finished, stated = result.finished, (scale or result.scale).frame_rate
+    stamps, number, names = _stamped_times(result), result.number[finished], np.array(result.names)[finished]
+    if _rises(stamps):
+        seconds: FloatArray | None = stamps
+        choice = "the frames' own times %.6g: these are taken"
+        recorded = np.median(np.maximum(np.diff(number), 1) / np.diff(stamps)) if len(stamps) > 1 else None
     else:
-        seconds, choice = stamps * 1e-9, "the frames' own times %.6g: these are taken"
-        recorded = np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)) if len(seconds) > 1 else None
+        rate, _ = frame_rate(result, scale)
+        recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
+        seconds = number / rate if rate else None
+        if not np.isnan(stamps).all():
+            row = int(np.argmax(np.isnan(stamps) | (np.diff(stamps, prepend=-np.inf) <= 0)))
+            problem = "has none" if np.isnan(stamps[row]) else "is not later than the one before"
+            text = "the time stamps of the frames are not used: %s %s (frame_rate in [scale] states the times)"
+            logger.warning(text, names[row], problem)
+        if seconds is not None and not _rises(seconds):
+            logger.warning("no time is known: the numbers of the frames do not rise")
+            seconds = None
     # stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %
-    if recorded and scale.frame_rate and abs(recorded / scale.frame_rate - 1) > 0.01:
-        logger.warning(f"scale.frame_rate states %g frames per second, {choice}", scale.frame_rate, recorded)
+    if recorded and stated and abs(recorded / stated - 1) > 0.01:
+        logger.warning(f"scale.frame_rate states %g frames per second, {choice}", stated, recorded)
     if seconds is None:
         return None
     times = np.full(len(result), np.nan)
@@ -170,12 +211,10 @@ class ResultInUnits(Portable):
         The result.
     scale
         What replaces its ``[scale]``; None: nothing.
-    units
-        Of lengths and times.
-    times : ndarray, shape (T,)
-        Of the frames: seconds where all are known and each is later than the one before, else places in the result.
     rectified
         Change to rectified px, where a camera is stated.
+    timed
+        Whether the times of the frames are read, and known.
     gauge
         Length of the virtual strain gauges in (rectified) px; None: the shortest there are.
     measure
@@ -184,9 +223,8 @@ class ResultInUnits(Portable):
 
     result: Result
     scale: ScaleSettings | None
-    units: Units
-    times: FloatArray
     rectified: Rectification
+    timed: bool = False
     gauge: float | None = None
     measure: str = MEASURES[0]
 
@@ -198,14 +236,37 @@ class ResultInUnits(Portable):
     @classmethod
     def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
-        rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
-        return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
+        return cls(result=result, scale=scale, rectified=rectification_of(result, scale))
 
     def with_times(self) -> Self:
         """Read the times of all frames."""
-        if (times := self.seconds) is None or not (np.diff(times) > 0).all():
-            return self
-        return replace(self, times=times, units=replace(self.units, timed=True))
+        return self._changed("units", "columns", timed=self.seconds is not None)
+
+    def with_strain(self, gauge: float | None, measure: str) -> Self:
+        """Take the strain over another gauge, or of another measure."""
+        return self._changed("gauges", gauge=gauge, measure=measure)
+
+    def refreshed(self, result: Result) -> Self:
+        """Take the result with the frames that a run has added since."""
+        return self._changed("seconds", result=result)
+
+    def _changed(self, *outdated: str, **changes: Any) -> Self:
+        """Change fields, and keep what was derived, such as the covariance of the nodes, unless it is outdated."""
+        kept = self.__dict__.keys() - {*self.__dataclass_fields__, *outdated}
+        changed = replace(self, **changes)
+        changed.__dict__.update({name: self.__dict__[name] for name in kept})
+        return changed
+
+    @cached_property
+    def units(self) -> Units:
+        """Units of lengths and times."""
+        return replace(self.rectified.units, timed=self.timed)
+
+    @property
+    def times(self) -> FloatArray:
+        """Times (T,) of the frames: seconds where they are `timed`, NaN if not measured; else places in the result."""
+        seconds = self.seconds if self.timed else None
+        return np.arange(len(self.result), dtype=np.float64) if seconds is None else seconds
 
     components: ClassVar[tuple[str, ...]] = ("u", "v")
 
@@ -349,16 +410,14 @@ class ResultInUnits(Portable):
 
     def displacement(self, frame: int) -> Displacement:
         """Read the displacement of all nodes in a frame, in rectified px."""
-        return self._rectify(next(self.result.table.iterate(DISPLACEMENT_QUANTITIES, [frame])))
+        record = self.result.table.read(frame, DISPLACEMENT_QUANTITIES)
+        return self._rectified(record, ("_std", "_bias_std"))[0]
 
-    def _rectify(self, record: Mapping[str, AnyArray], *suffixes: str) -> Displacement:
-        """Return the displacement of a record in rectified px, with uncertainties whose names have these suffixes."""
-        std = [record[f"{name}{suffix}"] for suffix in suffixes or ("_std", "_bias_std") for name in self.components]
-        displacement = Displacement.in_plane(record["u"], record["v"], *std)
-        if (bias := displacement.bias) is not None:  # NaN in records that were made without it
-            no_bias = np.isnan(bias) & np.isfinite(displacement.uncertainty)
-            displacement = replace(displacement, bias=np.where(no_bias, 0.0, bias))
-        return self.rectified.displacement(displacement)
+    def _rectified(self, record: Mapping[str, AnyArray], *suffixes: Sequence[str]) -> list[Displacement]:
+        """Return the displacement of a record in rectified px, with each group of uncertainties by their suffixes."""
+        groups = [[record[f"{name}{suffix}"] for suffix in group for name in UV] for group in suffixes]
+        in_px = [Displacement.in_plane(record["u"], record["v"], *std) for std in groups]
+        return [self.rectified.displacement(displacement) for displacement in in_px]
 
     def field(self, name: str, frame: int) -> Field:
         """Read one of the `quantities` with its standard uncertainty in a frame, in the reader's unit."""
@@ -382,7 +441,7 @@ class ResultInUnits(Portable):
         component, _, suffix = name.partition("_")
         if component not in self.components:
             return np.asarray(record[name])
-        rectified = self._rectify(record, f"_{suffix}").uncertainty
+        rectified = self._rectified(record, [f"_{suffix}"])[0].uncertainty
         return np.asarray(self.length * rectified[self.components.index(component)])
 
     def _discretisation_error(self, entry: ResultQuantity, record: Mapping[str, AnyArray]) -> FloatArray:
@@ -404,15 +463,15 @@ class ResultInUnits(Portable):
 
     def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `columns` of one frame, each in its type; errors as `Result.frame`."""
-        record = next(self.result.table.iterate(None, [index]))
-        displacement, edge = self._rectify(record), self._rectify(record, "_edge_std").std
-        gradient = self.mesh.element_gradient(displacement.values.T)
-        strain = self.gauges.strain(displacement, self.measure)
+        record, length = self.result.table.read(index), self.length
+        displacement, edge = self._rectified(record, ("_std", "_bias_std"), ["_edge_std"])
+        gradient = self.rectified.mesh.element_gradient(displacement.values.T)
         in_elements = unchecked_strain(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
+        strain = self.gauges.strain(displacement, self.measure)
         columns: dict[str, Any] = {name: np.asarray(record[name]) for name in self.columns if name in record}
         for field in (*map(self.units.convert, displacement.components), *strain.values()):
             columns |= {field.name: field.values, f"{field.name}_std": field.std}
             if field.bias is not None:
                 columns[f"{field.name}_bias_std"] = field.bias
-        columns |= zip(("u_edge_std", "v_edge_std"), self.length * np.asarray(edge), strict=True)
+        columns |= zip(("u_edge_std", "v_edge_std"), length * np.asarray(edge.std), strict=True)
         return columns | {f"{name}_element": in_elements[name].values for name in TENSOR}

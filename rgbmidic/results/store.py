@@ -16,8 +16,8 @@ from typing import Self
 
 import numpy as np
 
+from rgbmidic.disk import remove_partial_files, write_arrays, write_errors, write_json
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import remove_partial_files, write_arrays, write_errors, write_json
 from rgbmidic.results.lock import ALL_FRAMES, FrameLock
 from rgbmidic.results.provenance import (
     PROVENANCE,

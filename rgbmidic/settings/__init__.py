@@ -7,7 +7,6 @@ from rgbmidic.settings.conversion import (
     read_section,
     read_table,
     read_toml,
-    require_regular_file,
     unique_keys,
 )
 from rgbmidic.settings.schema import (
@@ -65,7 +64,6 @@ __all__ = [
     "read_table",
     "read_test",
     "read_toml",
-    "require_regular_file",
     "to_plain",
     "unique_keys",
 ]

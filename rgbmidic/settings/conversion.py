@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast, get_args
 
 from rgbmidic.arguments import convert_field, convert_fields, type_hints
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import ConfigurationError
 
 _Section = TypeVar("_Section")
@@ -43,37 +44,6 @@ def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise ConfigurationError(f"[{name}] must be a section with keys, not {table!r}")
     return dict(table)
-
-
-def require_regular_file(path: Path) -> Path:
-    """Return path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
-
-    Every file that is read is opened as this gives it. One that is missing is left for the opening to report.
-
-    Parameters
-    ----------
-    path
-        Of a file that is to be read.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    OSError
-        It is not a regular file.
-
-    Examples
-    --------
-    >>> require_regular_file(Path("test.toml")).name
-    'test.toml'
-    """
-    if "\0" in str(path):
-        raise OSError("its name holds a NUL")
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise OSError("it is not a regular file but a pipe, a socket or a device")
-    return path
 
 
 def read_toml(path: Path, description: str) -> dict[str, Any]:

@@ -119,7 +119,7 @@ class IlluminationSettings(CheckedSettings):
 
 
 FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
-"""Checks of a frame against its calibration (`rgbmidic.illumination.frame_check`)."""
+"""Checks of a frame against its calibration (`rgbmidic.tools.preparation.frame_check`)."""
 
 ELEMENT_SIZE = 25.0
 """Side of the elements in px where nobody states another: the paper's (section 2.2)."""
@@ -142,7 +142,7 @@ class CalibrationSettings(CheckedSettings):
         What ``rgbmidic-calibrate`` wrote; needed for colour frames, unless a script gives its own separation.
     accept
         Checks of the reference frame against the calibration whose contradictions are accepted
-        (`rgbmidic.illumination.frame_check`).
+        (`rgbmidic.tools.preparation.frame_check`).
 
     Examples
     --------
@@ -164,7 +164,7 @@ class MeshSettings(CheckedSettings):
     ----------
     element_size
         Side of the elements in px, 25 where none is stated; ``"auto"``: what a study of the test's own frames
-        recommends (`rgbmidic.pipeline.resolution`); None with `file`, which has its own.
+        recommends (`rgbmidic.tools.preparation.element_size`); None with `file`, which has its own.
     cracks
         Paths, each of corners (x, y) in px on the reference, along which the mesh is split.
     file
@@ -180,7 +180,7 @@ class MeshSettings(CheckedSettings):
         frames (``"key"``): every 16th and the last.
     refine
         Whether elements are bisected where the discretisation error of strain is more than twice its noise
-        (`rgbmidic.pipeline.refinement.refine`), in the frame of this index, or in a key frame (True).
+        (`rgbmidic.tools.preparation.refinement.refine`), in the frame of this index, or in a key frame (True).
 
     Examples
     --------
@@ -355,7 +355,7 @@ class SolverSettings(CheckedSettings):
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
     tolerance
-        The iteration stops when no node moves by more than this (px).
+        The iteration stops when a fifth of this (px) is left of the motion of any node, as the last two steps have it.
     max_iterations
         Iterations before the frame counts as not converged.
 

@@ -5,8 +5,8 @@ the dynamic range.
 
 The threshold of a set-up is found as there, from the first measurement without weights. Where the perturbation P is
 half as large again as elsewhere, the reflection disturbs; the grey level of the blurred image on the contour of that
-zone is the level above which the light is excluded. `rgbmidic.pipeline.automatic_threshold` makes that measurement
-from the frames of a test.
+zone is the level above which the light is excluded. `rgbmidic.tools.preparation.automatic_threshold` measures it on the
+frames of a test.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from textures import Texture
 from rgbmidic import CameraCalibration, measure
 from rgbmidic.cli.app import app, command
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.fields import Displacement, Rectification
+from rgbmidic.fields import Displacement, Rectification, Units
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore, export_result
 from rgbmidic.results.histories import read_histories
@@ -119,7 +119,7 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     where, lens = pose(4, 3, turn=20), lens_of(-2)
     field = moved(where, lens, MOTIONS["translation"][0])
     random, one = np.random.default_rng(0), np.ones(NODES)
-    rectified = Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed=0))
+    rectified = Rectification.of(MESH, Units(), calibrated(where, lens, seed=0))
     draws = [
         rectified.displacement(
             Displacement.in_plane(*(field + np.array(STD)[:, None] * random.normal(size=field.shape)))
@@ -134,7 +134,7 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     np.testing.assert_array_equal(~missing.is_measured, np.arange(NODES) == 7)
     field = moved(where, lens, MOTIONS["translation"][0])
     # the camera's own: calibrations that differ by the noise of their corners alone
-    found = [Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed)) for seed in range(8)]
+    found = [Rectification.of(MESH, Units(), calibrated(where, lens, seed)) for seed in range(8)]
     exact = MOTIONS["translation"][0](np.zeros((1, 2)))[0]
     axes = turn_of(where, lens)
     errors = [
@@ -163,6 +163,7 @@ def stretched(tmp_path: Path) -> tuple[Result, Path]:
     return result_of(tmp_path / "result", fields, ScaleSettings(camera=tmp_path / "camera.json")), tmp_path
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -> None:
     result, folder = stretched
     camera = CameraCalibration.read(folder / "camera.json")

@@ -33,10 +33,6 @@ def plane(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 0.3 + 0.004 * x - 0.003 * y, -0.2 + 0.002 * x + 0.005 * y
 
 
-def still(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return np.zeros_like(x), np.zeros_like(y)
-
-
 def hole(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A free hole in a sheet under tension along x, strain .01 far from it (Kirsch 1898; plane stress)."""
     r, angle = np.hypot(x - MIDDLE, y - MIDDLE), np.arctan2(y - MIDDLE, x - MIDDLE)
@@ -139,7 +135,6 @@ def test_an_affine_field_is_hardly_inflated() -> None:
 
 
 def test_it_is_not_known_without_being_asked_for_and_where_nothing_is_measured() -> None:
-    assert np.isnan(measured(still, mesh_error=False).displacement_error).all()
     y, x = np.mgrid[:SIZE, :SIZE].astype(float)
     texture, random = Texture.random(1), np.random.default_rng(0)
     image = texture.at(x, y)
@@ -151,5 +146,6 @@ def test_it_is_not_known_without_being_asked_for_and_where_nothing_is_measured()
     assert np.isnan(found.displacement_error[lost]).all()
     assert np.isfinite(found.displacement_error[found.measured]).mean() > 0.9
     assert (np.isfinite(found.displacement_std) == np.isfinite(found.displacement)).all()
-    small = correlate(*pair, region=REGION, element_size=6, initial=(0, 0), mesh_error=True)
-    assert np.isnan(small.displacement_error).all()
+    part = {"region": (200, 200, 299, 299), "initial": (0, 0)}
+    assert np.isnan(correlate(*pair, **part, element_size=ELEMENT, mesh_error=False).displacement_error).all()
+    assert np.isnan(correlate(*pair, **part, element_size=6, mesh_error=True).displacement_error).all()

@@ -14,12 +14,13 @@ from textures import Affine, Texture
 from rgbmidic import CameraCalibration, Result, Tri3Mesh, measure_sequence
 from rgbmidic.cli.app import app
 from rgbmidic.cli.command import execute
+from rgbmidic.errors import InputError
 from rgbmidic.fields import Displacement, NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
 from rgbmidic.results.result_in_units import ResultInUnits
-from rgbmidic.settings import read_test
+from rgbmidic.settings import ScaleSettings, read_test
 from rgbmidic.tools.finite_elements import placement_of
 from rgbmidic.typing import FloatArray
 
@@ -119,7 +120,7 @@ def test_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(test_file: Path) -> Result:
     out = test_file.with_name("result")
-    assert execute(app, ["run", str(test_file), "--out", str(out)]) == 0
+    assert execute(app, ["run", str(test_file), "--out", str(out), "--no-figures"]) == 0
     return Result.open(out)
 
 
@@ -132,6 +133,8 @@ def test_a_test_is_measured_on_the_mesh_of_a_file(result: Result) -> None:
     assert placement is not None
     assert placement.to_px(result.node_mm) == pytest.approx(result.nodes)
     assert ResultInUnits.without_times(result).units.mm_per_pixel == pytest.approx(0.1)
+    with pytest.raises(InputError, match=r"scale\.mm_per_pixel \(0\.2\) states a scale, the mesh of .* has another"):
+        ResultInUnits.without_times(result, ScaleSettings(mm_per_pixel=0.2))
 
 
 def test_every_output_has_the_numbers_and_the_mesh_s_own_coordinates(result: Result, tmp_path: Path) -> None:

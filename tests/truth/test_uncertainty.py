@@ -198,18 +198,6 @@ def test_statistics_beat_the_best_threshold_where_reflections_are_erratic() -> N
     assert error(None) * BETTER < min(error(threshold) for threshold in (0.33, 0.36, 0.4, 0.45, 0.5, 0.6, 0.7))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-def test_three_lights_beat_each_alone(sphere: Sphere, angle: float) -> None:
-    reference, deformed = (sphere.images(sphere.lights[a], "bayer", seed).values for seed, a in enumerate((0.0, angle)))
-
-    def error(found: Solution) -> float:
-        mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
-        return field_rms(mesh, found.displacement, sphere.truth[angle], border=25)
-
-    alone = [error(correlate(reference[light], deformed[light], region=REGION)) for light in range(3)]
-    assert error(sphere.in_motion(angle, "bayer")) < min(alone)
-
-
 def _off(lights: np.ndarray) -> None:
     lights[0] = 0
 

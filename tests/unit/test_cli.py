@@ -505,6 +505,7 @@ def test_a_wrong_shape_is_answered_with_an_example(command: Run, tmp_path: Path)
     assert (status, error) == (2, "error: --shape is ROWSxCOLUMNS, such as 512x768, not '512 768'\n")
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_test_is_inspected_by_its_reference(command: Run, tmp_path: Path) -> None:
     test = colour_test(tmp_path / "test", [(0.0, 0.0), (0.3, 0.1)])
     file = test.folder / "TEST.toml"

@@ -22,7 +22,7 @@ SLOW = {"scipy.signal", "scipy.stats", "scipy.optimize", "numba", "llvmlite"}
 LACKS = {
     "rgbmidic": {"typer", "rich", "matplotlib", "colour"},
     ", ".join(f"rgbmidic.{room}" for room in CORE): TOOLS | SLOW,
-    "rgbmidic._kernels.render": {"numba", "llvmlite"},
+    "rgbmidic.tools.scene.kernels": {"numba", "llvmlite"},
     "rgbmidic.tools.report": {"matplotlib", "numba"},
     "rgbmidic.cli.app, rgbmidic.pipeline.run": {"bokeh", "tornado"},
 }

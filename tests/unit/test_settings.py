@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 import rgbmidic
 import rgbmidic.settings
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings import (
     BAYER_PATTERNS,
@@ -34,7 +35,6 @@ from rgbmidic.settings import (
     TestSettings,
     WeightSettings,
     read_test,
-    require_regular_file,
     unique_keys,
 )
 

@@ -222,7 +222,7 @@ class Comparison:
         units = placement if placement.camera is None else rectification_of(result, scale, "mm").units
         self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-        self._blocks = image.areas.sum() / max(USUAL.min_block_side, USUAL.block_side_per_element * image.size) ** 2
+        self._blocks = image.areas.sum() / USUAL.merged_block_side(image.size) ** 2
 
     @property
     def gauge(self) -> float:

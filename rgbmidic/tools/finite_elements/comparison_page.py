@@ -12,8 +12,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from rgbmidic.disk import write_complete, write_errors, write_table
 from rgbmidic.errors import import_optional
-from rgbmidic.results.files import write_complete, write_errors, write_table
 from rgbmidic.text import format_with_std
 from rgbmidic.tools.finite_elements.comparison import VARIANTS, Comparison, FrameComparison
 from rgbmidic.tools.finite_elements.simulation_nodes import COMPARED_QUANTITIES

@@ -12,7 +12,7 @@ direction of the crack, the shear modulus G and Kolosov's constant k::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ from rgbmidic.fields.cracks import comma_separated, crack_faces, nearest_node
 from rgbmidic.fields.history import of_probe
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.fields.nodal import NodalCovariance
-from rgbmidic.fields.units import Units
+from rgbmidic.fields.quantity import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
@@ -173,12 +173,12 @@ class StressIntensity:
 
     Attributes
     ----------
-    factors, factors_std : ndarray, shape (T, 2)
-        K_I and K_II and their standard uncertainty, MPa √m. K_II is positive where the left side moves ahead.
-    t_stress, t_stress_std : ndarray, shape (T,)
-        MPa.
-    extension, extension_std : ndarray, shape (T,), or None
-        Distance (px) by which the fitted tip is ahead of the mesh's; None where it is not fitted.
+    factors
+        K_I and K_II, MPa √m, shape (T, 2). K_II is positive where the left side moves ahead.
+    t_stress
+        MPa, shape (T,).
+    extension
+        Distance (px) by which the fitted tip is ahead of the mesh's, shape (T,); None where it is not fitted.
     chi_square : ndarray, shape (T,)
         Of the fit over its degrees of freedom: 1 where the series describes the field within its stated uncertainty.
     terms
@@ -186,27 +186,19 @@ class StressIntensity:
 
     Examples
     --------
-    >>> zero = np.zeros((1, 2))
+    >>> dims, std = ("frame", "mode"), np.full((1, 2), 0.5)
+    >>> factors = Field(name="K", unit="MPa √m", dims=dims, values=np.full((1, 2), 25.0), std=std)
+    >>> t_stress = Field(name="T", unit="MPa", values=np.zeros(1), std=np.array([3.0]))
     >>> intensity = StressIntensity(
-    ...     factors=zero + 25.0,
-    ...     factors_std=zero + 0.5,
-    ...     t_stress=zero[:, 0],
-    ...     t_stress_std=zero[:, 0] + 3,
-    ...     extension=None,
-    ...     extension_std=None,
-    ...     chi_square=zero[:, 0] + 1,
-    ...     terms=4,
+    ...     factors=factors, t_stress=t_stress, extension=None, chi_square=np.ones(1), terms=4
     ... )
-    >>> intensity.factors[0].tolist()  # MPa √m
+    >>> intensity.factors.values[0].tolist()  # MPa √m
     [25.0, 25.0]
     """
 
-    factors: FloatArray
-    factors_std: FloatArray
-    t_stress: FloatArray
-    t_stress_std: FloatArray
-    extension: FloatArray | None
-    extension_std: FloatArray | None
+    factors: Field
+    t_stress: Field
+    extension: Field | None
     chi_square: FloatArray
     terms: int
 
@@ -352,14 +344,11 @@ class CrackTip:
         # coefficients are those of (r / outer)^(n/2); a pixel is mm_per_pixel / 1000 m
         factors = scale * np.sqrt(2 * np.pi * units.mm_per_pixel * 1e-3 / outer) * coefficients[:, :2]
         factors[..., 1] = np.hypot(factors[..., 1], factors[..., 0] * units.mm_per_pixel_std / units.mm_per_pixel / 2)
-        t_stress = 4 * scale / outer * coefficients[:, 2]
+        (t_stress, t_std), (ahead, ahead_std) = (4 * scale / outer * coefficients[:, 2]).T, coefficients[:, 3].T
         return StressIntensity(
-            factors=factors[..., 0],
-            factors_std=factors[..., 1],
-            t_stress=t_stress[:, 0],
-            t_stress_std=t_stress[:, 1],
-            extension=coefficients[:, 3, 0] if fit_tip else None,
-            extension_std=coefficients[:, 3, 1] if fit_tip else None,
+            factors=Field(name="K", unit="MPa √m", dims=("frame", "mode"), values=factors[..., 0], std=factors[..., 1]),
+            t_stress=Field(name="T", unit="MPa", values=t_stress, std=t_std),
+            extension=Field(name="extension", unit="px", values=ahead, std=ahead_std) if fit_tip else None,
             chi_square=chi_square,
             terms=terms,
         )
@@ -394,13 +383,8 @@ class CrackTip:
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
             )
-        quantities = [
-            Field(name="K1", unit="MPa √m", values=s.factors[:, 0], std=s.factors_std[:, 0]),
-            Field(name="K2", unit="MPa √m", values=s.factors[:, 1], std=s.factors_std[:, 1]),
-            Field(name="T", unit="MPa", values=s.t_stress, std=s.t_stress_std),
-        ]
-        if s.extension is not None:
-            quantities.append(Field(name="extension", unit="px", values=s.extension, std=s.extension_std))
+        modes = [replace(s.factors.isel(mode=mode), name=f"K{mode + 1}") for mode in range(2)]
+        quantities = [*modes, s.t_stress, *([] if s.extension is None else [s.extension])]
         return of_probe(self.name, [*quantities, Field(name="chi_square", values=s.chi_square)], note)
 
 

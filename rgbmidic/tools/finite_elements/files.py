@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.mesh.outline_mesh import cross
-from rgbmidic.settings import LENGTH_UNITS, require_regular_file
+from rgbmidic.settings import LENGTH_UNITS
 from rgbmidic.tools.finite_elements.abaqus import read_abaqus
 from rgbmidic.tools.finite_elements.gmsh import read_gmsh
 from rgbmidic.tools.finite_elements.mesh import ROUNDING, FiniteElementMesh

@@ -15,8 +15,8 @@ from typing import Self
 
 import numpy as np
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError
-from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray, IntArray
 
 CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}

@@ -20,6 +20,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import MeshPoints
 from rgbmidic.frames.names import NamedFiles
@@ -28,7 +29,7 @@ from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import rectification_of
-from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings
 from rgbmidic.tools.finite_elements.files import read_mesh
 from rgbmidic.tools.finite_elements.mesh import FiniteElementMesh
 from rgbmidic.tools.finite_elements.mesh_source import placement_of
@@ -299,9 +300,7 @@ def find_placement(
             "each in mm and in px (`point_pairs`)"
         )
     placement = Placement.fit(points, rectification_of(result, scale, "mm").camera, label=source)
-    mm_per_pixel = (
-        scale or result.section(ScaleSettings)
-    ).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    mm_per_pixel = (scale or result.scale).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
     if (
         placement.mm_per_pixel is not None
         and mm_per_pixel is not None

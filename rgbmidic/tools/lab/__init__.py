@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from rgbmidic._version import __version__
 from rgbmidic.arguments import to_plain
+from rgbmidic.disk import write_errors, write_json, write_text
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import write_errors, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

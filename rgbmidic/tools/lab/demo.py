@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import erf
 
 from rgbmidic._kernels import are_compiled
+from rgbmidic.disk import write_errors
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import CameraCalibration, at_nodes, field_rms
 from rgbmidic.fields.plane import undistorted
@@ -27,11 +28,10 @@ from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
-from rgbmidic.pipeline.resolution import rms
 from rgbmidic.results import Result
-from rgbmidic.results.files import write_errors
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
+from rgbmidic.tools.preparation.element_size import rms
 from rgbmidic.typing import FloatArray, FloatImage, ProgressCallback
 
 _SCENE = """\

@@ -11,10 +11,10 @@ import numpy as np
 
 from rgbmidic.arguments import to_plain
 from rgbmidic.errors import InputError
-from rgbmidic.pipeline.resolution import rms
 from rgbmidic.tools.lab import format_number, schema_document, write_findings
 from rgbmidic.tools.lab.planning import LampPlan, Outlook
 from rgbmidic.tools.lab.stereo_planning import StereoOutlook, stereo_figures
+from rgbmidic.tools.preparation.element_size import rms
 from rgbmidic.tools.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.tools.scene.scene import Scene
 from rgbmidic.tools.scene.zones import REFLECTS

@@ -23,8 +23,8 @@ from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.recovery import Recovery
 from rgbmidic.pipeline.frame_quality import SPECKLES
-from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.tools.lab import format_number, schema_document, write_findings
+from rgbmidic.tools.preparation.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

@@ -78,7 +78,7 @@ class TimeHistory:
         self.component_stds = tuple(f"{name}_std" for name in self.components)
         names = (*self.components, *self.component_stds, "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
         self.axis = style.time_axis(times if self.has_times else None, physical.result.number[list(frames)])
-        self.fields = Maps(result=physical.result, physical=physical).quantities
+        self.fields = Maps(physical=physical).quantities
         self.quantiles = {name: np.full((len(times), 3), np.nan) for name in names}
         self.fractions = np.empty((len(times), len(QUANTITIES["node_status"].codes)))
         self.fastest, previous = 0.0, np.array(np.nan)

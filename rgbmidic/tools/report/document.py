@@ -12,12 +12,12 @@ from urllib.parse import quote
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.disk import check_file, write_text
 from rgbmidic.errors import InputError
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
-from rgbmidic.results.files import check_file, write_text
+from rgbmidic.results import QUANTITIES, Maps, Result, speckle_diameter
 from rgbmidic.results.histories import read_histories
-from rgbmidic.results.result_in_units import ResultInUnits
-from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
+from rgbmidic.results.result_in_units import ResultInUnits, frame_rate
+from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings
 from rgbmidic.tools.report import curves, figures, style
 from rgbmidic.tools.report.gallery import REPORT
 from rgbmidic.tools.report.noise_floor import noise_floor
@@ -138,7 +138,7 @@ def write_report(
     if frames is None:
         sampled_frames = figures.select_evenly(figures.measured_frames(result), constants.map_frames)
         frames = sorted({*sampled_frames, history.farthest})
-    maps = figures.MapDrawer(Maps(result=result, physical=physical), style.PAGE_DPI)
+    maps = figures.MapDrawer(Maps(physical=physical), style.PAGE_DPI)
     exposure, speckle = provenance.get("exposure_ns"), speckle_size(result)
     statuses = result.status[list(result.deformed)]
     unconverged = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]
@@ -157,12 +157,10 @@ def write_report(
         history=history,
         measured_fraction=history.fractions[:, 0],
         floor=noise_floor(physical),
-        histories=read_histories(result, probes, scale=physical.scale, channels=channels)
-        if probes.kind_coordinates
-        else None,
+        histories=read_histories(physical, probes, channels=channels) if probes.kind_coordinates else None,
         lines=_lines(maps.maps, probes, constants),
         frame_label=partial(_frame_label, physical),
-        rate=_frame_rate(physical),
+        rate=frame_rate(result, physical.scale),
         exposure=None if exposure is None else f"{exposure / 1000:g} µs",
         blur=1e-9 * (exposure or 0) * history.fastest if physical.units.timed else 0,
         speckle=None if speckle is None else physical.in_units(speckle),
@@ -173,17 +171,6 @@ def write_report(
         ),
     )
     write_text(out, text)
-
-
-def _frame_rate(physical: ResultInUnits) -> tuple[float | None, str]:
-    """Return the frame rate that `frame_times` follows, and its source; None if the frames have time stamps."""
-    result = physical.result
-    camera_rate = result.provenance.get("frame_rate"), "by the camera's file"
-    settings_rate = (physical.scale or result.section(ScaleSettings)).frame_rate, "as stated"
-    has_time_stamps = (result.time_ns[result.finished] != UNKNOWN_TIME).all()
-    return next(
-        (rate for rate in ([camera_rate] if has_time_stamps else [settings_rate, camera_rate]) if rate[0]), (None, "")
-    )
 
 
 def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Iterator[dict[str, Any]]:
@@ -223,7 +210,7 @@ def _frame_label(physical: ResultInUnits, frame: int) -> str:
 
 
 def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> None:
-    """Write the table of a batch (`rgbmidic.pipeline.batch.summary_rows`) as a page with links to the tests' reports.
+    """Write the table of a batch (`rgbmidic.tools.batch.summary_rows`) as a page with links to the tests' reports.
 
     Parameters
     ----------

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rgbmidic.disk import remove_partial_files, write_errors
 from rgbmidic.errors import ResultError
 from rgbmidic.results import Maps, Result
-from rgbmidic.results.files import remove_partial_files, write_errors
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.figures import (
     MAPS,

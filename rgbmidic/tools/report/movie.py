@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete
 from rgbmidic.errors import InputError, ResultError, RgbmidicError, import_optional
 from rgbmidic.renamed import state_new_names
-from rgbmidic.results import QUANTITIES, Maps, ResultQuantity, frame_times
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results import QUANTITIES, Maps, ResultQuantity
 from rgbmidic.tools.report import style
 from rgbmidic.tools.report.curves import Curve
 from rgbmidic.tools.report.figures import field_colours, picture_limits, select_evenly
@@ -161,7 +161,7 @@ class FieldMovie:
     @cached_property
     def times(self) -> FloatArray | None:
         """Times (T,) of all frames of the result in s; None where not known."""
-        return frame_times(self.maps.result, self.maps.physical.scale)
+        return self.maps.physical.seconds
 
     @cached_property
     def _layout(self) -> tuple[tuple[_Panel, ...], tuple[_Span, _Span]]:
@@ -330,7 +330,7 @@ class _Canvas:
         movie, canvas, times = self.movie, self._canvas, self._times
         canvas.restore_region(self._background)
         result = movie.maps.result
-        status, time = QUANTITIES["status"].codes[next(result.iterate("status", [frame]))], ""
+        status, time = QUANTITIES["status"].codes[result.table.read(frame, ["status"])["status"]], ""
         if times is not None:
             factor, unit, decimals = self._clock
             time = f"{factor * times[frame]:.{decimals}f} {unit}   "

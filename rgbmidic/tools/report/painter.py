@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.picture import paint_field
 from rgbmidic.results import Maps, Result, ResultQuantity
+from rgbmidic.tools.report.kernels import paint_field
 from rgbmidic.tools.report.style import STATUS_COLOURS
 from rgbmidic.typing import AnyArray, FloatArray
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rgbmidic.disk import write_complete
 from rgbmidic.errors import InputError
-from rgbmidic.results.files import write_complete
+from rgbmidic.text import format_times
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
@@ -193,7 +194,7 @@ def time_unit(seconds: FloatArray) -> tuple[float, str]:
 def time_text(seconds: float, scale: FloatArray) -> str:
     """Return a time with the unit that suits the times `scale` (T,) of which it is one."""
     factor, unit = time_unit(scale)
-    return f"{factor * seconds:.6g} {unit}"
+    return f"{format_times([*(factor * scale), factor * seconds], digits=6)[-1]} {unit}"
 
 
 def time_axis(seconds: FloatArray | None, frames: AnyArray) -> tuple[FloatArray, str]:

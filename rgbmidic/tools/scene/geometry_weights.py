@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.arguments import checked
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.settings import TestSettings, require_regular_file
+from rgbmidic.settings import TestSettings
 from rgbmidic.tools.scene.forecast import Instrument
 from rgbmidic.tools.scene.scene import Scene, State, read_scene
 from rgbmidic.tools.scene.zones import Zones, material_points, predict_zones, unit_vectors, zones_on_surface

@@ -12,19 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rgbmidic._kernels import render as kernels
 from rgbmidic.arguments import bounded, check_fields
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.settings import (
-    ELEMENT_SIZE,
-    check_names,
-    convert_value,
-    read_section,
-    read_table,
-    read_toml,
-    require_regular_file,
-)
-from rgbmidic.tools.scene import SceneSection
+from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml
+from rgbmidic.tools.scene import SceneSection, kernels
 from rgbmidic.tools.scene.camera import (
     PIXEL,
     REFERENCE_CROSSTALK,

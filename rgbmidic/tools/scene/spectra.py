@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.arguments import check_fields
+from rgbmidic.disk import require_regular_file
 from rgbmidic.errors import InputError
-from rgbmidic.settings import require_regular_file, unique_keys
+from rgbmidic.settings import unique_keys
 from rgbmidic.typing import FloatArray
 
 HALF_MAXIMUM = 0.921823

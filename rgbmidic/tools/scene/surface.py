@@ -14,10 +14,10 @@ import numpy.typing as npt
 from scipy.special import pdtr
 
 from rgbmidic._kernels.mesh import interpolate_at_points
-from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.arguments import bounded, check_fields, checked
 from rgbmidic.errors import InputError
 from rgbmidic.tools.scene import SceneSection
+from rgbmidic.tools.scene.kernels import PLATE, sample_paint
 from rgbmidic.typing import FloatArray
 
 WRINKLE_FREQUENCY = 0.525
@@ -114,7 +114,7 @@ class Surface(SceneSection):
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
     def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
-        """Return the paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them.
+        """Return the paint, counts and seed, as the kernels of `rgbmidic.tools.scene.kernels` take them.
 
         Returns
         -------

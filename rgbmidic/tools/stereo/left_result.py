@@ -6,7 +6,7 @@ displacement, its uncertainty and the strain are those of the surface in space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -40,32 +40,18 @@ class CarriedTable(FrameTable):
     nodes: IntArray
     stereo: StereoResult
 
-    def iterate(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
-        """Read some quantities of one frame after the other; errors as `FrameTable.iterate`.
-
-        Parameters
-        ----------
-        names
-            The quantities; None: all.
-        frames
-            Their indices, in any order.
-
-        Yields
-        ------
-        dict
-            The quantities of a frame by name.
-        """
-        for frame in frames:
-            values = next(FrameTable.iterate(self, names, [frame]))
-            if self.finished[frame]:
-                of_nodes = [name for name in values if "node" in str(QUANTITIES[name].axes[:1])]
-                values |= {name: values[name][self.nodes] for name in of_nodes if len(values[name])}
-            if {"status", "node_status"} & values.keys():
-                space = self.stereo.frame(["status", "left_status", "right_status"], frame)
-                node_status = np.maximum(space["left_status"], space["right_status"])
-                statuses = {"status": int(space["status"]), "node_status": node_status}
-                values |= {name: statuses[name] for name in statuses.keys() & values.keys()}
-            yield values
+    def read(self, frame: int, names: Iterable[str] = QUANTITIES) -> dict[str, Any]:
+        """Read some quantities of a frame, as `FrameTable.read`."""
+        values = FrameTable.read(self, frame, names)
+        if self.finished[frame]:
+            of_nodes = [name for name in values if "node" in str(QUANTITIES[name].axes[:1])]
+            values |= {name: values[name][self.nodes] for name in of_nodes if len(values[name])}
+        if {"status", "node_status"} & values.keys():
+            space = self.stereo.frame(["status", "left_status", "right_status"], frame)
+            node_status = np.maximum(space["left_status"], space["right_status"])
+            statuses = {"status": int(space["status"]), "node_status": node_status}
+            values |= {name: statuses[name] for name in statuses.keys() & values.keys()}
+        return values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

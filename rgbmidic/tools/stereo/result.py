@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Self
 
 import numpy as np
 
+from rgbmidic.disk import write_table
 from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.field import column
 from rgbmidic.results import Result, ResultQuantity
-from rgbmidic.results.files import write_table
+from rgbmidic.text import format_times
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES, SCHEMA, SHARED, STEREO_FILE, VERSION, dimensions
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -227,8 +228,8 @@ class StereoResult:
     def _rows(self, entries: Sequence[ResultQuantity]) -> Iterator[list[object]]:
         names, shared = [entry.name for entry in entries], {entry.name for entry in SHARED}
         same = {name: self[name] for name in names if name in shared}
-        for frame, (name, seconds) in enumerate(zip(self.names, self.time.tolist(), strict=True)):
+        for frame, (name, seconds) in enumerate(zip(self.names, format_times(self.time.tolist()), strict=True)):
             values = self.frame(["number", "status", *(one for one in names if one not in shared)], frame) | same
-            cells = [frame, int(values["number"]), name, *([f"{seconds:.12g}"] if self.has_times else [])]
+            cells = [frame, int(values["number"]), name, *([seconds] if self.has_times else [])]
             columns = zip(*(values[one].tolist() for one in names), strict=True)
             yield from ([*cells, int(values["status"]), node, *numbers] for node, numbers in enumerate(columns))

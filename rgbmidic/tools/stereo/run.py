@@ -16,6 +16,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
+from rgbmidic.disk import check_file, write_complete, write_errors
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields import MEASURES
 from rgbmidic.frames import Window
@@ -25,9 +26,8 @@ from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import measure
 from rgbmidic.pipeline.plan import read_region
-from rgbmidic.pipeline.source import Series, open_frames
+from rgbmidic.pipeline.user_objects import Series, open_frames
 from rgbmidic.results import Result, common_variance_fraction, frame_times
-from rgbmidic.results.files import check_file, write_complete, write_errors
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import MeshSettings, TestSettings, read_test
 from rgbmidic.tools.stereo.axes import AxesChoice

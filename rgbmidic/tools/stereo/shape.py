@@ -236,7 +236,7 @@ def _is_plausible(surface: Triangulation) -> bool:
 
 def nodal_values(result: Result, frame: int, nodes: AnyArray | slice = slice(None)) -> dict[str, AnyArray]:
     """Read what `Shape.frame` needs of some nodes of a frame."""
-    values = next(result.table.iterate([*MATCHED, "number", "status"], [frame]))
+    values = result.table.read(frame, [*MATCHED, "number", "status"])
     return {name: values[name][nodes] if name in MATCHED else values[name] for name in values}
 
 

@@ -93,9 +93,7 @@ class SurfaceInUnits(ResultInUnits):
         mean_scale = float(np.sqrt(areas.sum() / mesh.areas.sum()))
         relative = float(result.stereo.attributes["relative_length_std"])
         units = Units(mm_per_pixel=mean_scale, mm_per_pixel_std=mean_scale * relative)
-        flat = Rectification(camera=None, image=mesh, mesh=mesh, units=units)
-        times = np.arange(len(result), dtype=np.float64)
-        return cls(result=result, scale=scale, units=units, times=times, rectified=flat)
+        return cls(result=result, scale=scale, rectified=Rectification(camera=None, image=mesh, mesh=mesh, units=units))
 
     @cached_property
     def points(self) -> FloatArray:

@@ -45,8 +45,8 @@ def keep_one_outline(marks: Sequence[Mark], new_kind: str) -> tuple[Mark, ...]:
 
 def region_section(stored: Mapping[str, Any], marks: Sequence[Mark]) -> dict[str, Any]:
     """Return the keys of ``[region]`` for what is drawn; without an outline a mask that is `stored` stays."""
-    outline, holes = region_of(marks), [*_complete_shapes(marks, HOLES).values()]
-    keys = {"mask": None if outline else stored.get("mask"), "holes": holes or None, **(outline or {})}
+    drawn = _drawn_keys(marks)
+    keys = {"mask": None if drawn.keys() - {"holes"} else stored.get("mask"), "holes": None, **drawn}
     return {"rectangle": None, "polygon": None, **keys} if stored or any(keys.values()) else {}
 
 
@@ -73,15 +73,21 @@ def _complete_shapes(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, 
     return corners_by_kind
 
 
+def _drawn_keys(marks: Sequence[Mark]) -> dict[str, Any]:
+    """Return the keys of ``[region]`` for the first outline that is complete, and for the holes that are."""
+    keys = dict[str, Any]()
+    for kind, corners in list(_complete_shapes(marks, OUTLINES).items())[:1]:
+        low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
+        keys |= {"rectangle": [*low, *high]} if kind == "rectangle" else {"polygon": corners}
+    if holes := [*_complete_shapes(marks, HOLES).values()]:
+        keys["holes"] = holes
+    return keys
+
+
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
-    outline, holes = _complete_shapes(marks, OUTLINES), [*_complete_shapes(marks, HOLES).values()]
-    if not outline:
-        return None
-    (kind, corners), *_ = outline.items()
-    low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
-    shape: dict[str, Any] = {"rectangle": [*low, *high]} if kind == "rectangle" else {"polygon": corners}
-    return {**shape, **({"holes": holes} if holes else {})}
+    keys = _drawn_keys(marks)
+    return keys if keys.keys() - {"holes"} else None
 
 
 def check_complete(marks: Sequence[Mark]) -> None:
@@ -99,11 +105,12 @@ def check_complete(marks: Sequence[Mark]) -> None:
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
     """Return the corners of the outline, as far as it is drawn, and of the complete holes."""
-    region, holes = region_of(marks) or {}, [*_complete_shapes(marks, HOLES).values()]
-    if "rectangle" in region:
-        x0, y0, x1, y1 = region["rectangle"]
-        return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], holes
-    return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], holes
+    keys = _drawn_keys(marks)
+    outline = keys.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES]
+    if "rectangle" in keys:
+        x0, y0, x1, y1 = keys["rectangle"]
+        outline = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]
+    return outline, keys.get("holes", [])
 
 
 def marks_of_region(section: Mapping[str, Any], base: Path) -> tuple[Mark, ...]:

@@ -92,7 +92,7 @@ class FieldsInView:
     """
 
     def __init__(self, result: Result, view: ViewState) -> None:
-        self.result, self.view = result, view
+        self.view = view
         self.scale: ScaleSettings | None = None
         self.derivation: tuple[Any, ...] = ()
         self._raw = lru_cache(VIEWER.raw_frames)(RawPictures(result=result))
@@ -106,6 +106,11 @@ class FieldsInView:
         )
         self._ahead: tuple[tuple[Any, ...], ...] = ()
         self._test_range = lru_cache(8)(partial(range_over_test, maps))
+
+    @property
+    def result(self) -> Result:
+        """The result, with the frames that a run has added up to now."""
+        return self.maps.result
 
     @property
     def base(self) -> Path:
@@ -124,7 +129,7 @@ class FieldsInView:
 
     def rescale(self) -> bool:
         """Take the scale of the view; returns whether it is another one."""
-        scale = self.view.scale_settings(self.base, self.result.section(ScaleSettings))
+        scale = self.view.scale_settings(self.base, self.result.scale)
         if scale == self.scale:
             return False
         self._use_maps(Maps.from_result(self.result, scale))
@@ -142,8 +147,7 @@ class FieldsInView:
 
     def grow(self, result: Result) -> None:
         """Go on with more frames of the result."""
-        self.result = result
-        self._use_maps(replace(self.maps, result=result))
+        self._use_maps(self.maps.refreshed(result))
 
     def values(self, name: str) -> Field:
         """Read a field in the frame in view."""
@@ -162,7 +166,7 @@ class FieldsInView:
     @property
     def node_status(self) -> AnyArray:
         """Status (N,) of the nodes in the frame in view."""
-        return np.asarray(next(self.result.iterate("node_status", [self.view.frame])))
+        return np.asarray(self.result.table.read(self.view.frame, ["node_status"])["node_status"])
 
     @property
     def names(self) -> list[str]:
@@ -258,7 +262,7 @@ class FieldsInView:
     def description(self, remark: str = "") -> str:
         """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
         result, maps, frame, field = self.result, self.maps, self.view.frame, self.maps.quantities[self.view.field]
-        record = next(result.table.iterate(["status", "reason", "node_status", "time_ns"], [frame]))
+        record = result.table.read(frame, ["status", "reason", "node_status", "time_ns"])
         missing = float(np.mean(record["node_status"] != 0))
         is_measured = bool(result.finished[frame])
         outcome = QUANTITIES["status"].codes[record["status"]] if is_measured else "not measured yet"

@@ -12,7 +12,6 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import MouseMove
 
-from rgbmidic.results import frame_times
 from rgbmidic.tools.report.painter import OUTSIDE_GREY, Picture, paint, palette
 from rgbmidic.tools.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, finish_picture, literal
 from rgbmidic.tools.view.canvas import Canvas
@@ -128,7 +127,7 @@ class MapPanel:
                 shift = x_offset * point, -y_offset * point
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
-        times = frame_times(fields.result, fields.maps.physical.scale)
+        times = fields.maps.physical.seconds
         title = fields.title(math.nan if times is None else float(times[view.frame]))
         note = dict.fromkeys(fields.maps.processing_note(name) for name in names)
         aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, note))}".strip()

@@ -14,9 +14,9 @@ from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.models import ColumnDataSource
 
+from rgbmidic.disk import write_complete
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import place_mesh, read_region
-from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
 from rgbmidic.tools.lab.inspection import Inspection
 from rgbmidic.tools.report.painter import OUTSIDE_GREY, Overlay, paint, palette

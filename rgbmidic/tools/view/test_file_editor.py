@@ -14,10 +14,10 @@ import numpy as np
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
+from rgbmidic.disk import write_text
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.results import Result
-from rgbmidic.results.files import write_text
 from rgbmidic.settings import FrameSettings, TestSettings, read_section, read_toml
 from rgbmidic.tools.view.drawing import masks_of
 from rgbmidic.tools.view.marks import Mark

@@ -61,7 +61,7 @@ class FrameProgress:
         self.changes += bool(is_stale.any() or len(frames))
         for frame in frames.tolist():
             try:
-                values = next(result.table.iterate(["status", "node_status"], [frame]))
+                values = result.table.read(frame, ["status", "node_status"])
             except ResultError:
                 values = {"status": _DAMAGED, "node_status": np.ones(1)}
             self.status[frame], self.fraction[frame] = values["status"], np.mean(values["node_status"] == 0)

@@ -343,6 +343,7 @@ def test_photographs_of_one_plane_show_one_place(tmp_path: Path, capsys: pytest.
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_the_command_writes_what_the_library_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     random = np.random.default_rng(4)
     tilts = ((20, 0), (-20, 5), (5, 22), (0, -22), (15, 15), (-14, -16))

@@ -116,6 +116,7 @@ def test_a_mistake_is_one_line_and_writes_nothing(run, tmp_path, arguments, mess
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_noise_then_merge_then_show(run, tmp_path):
     noise, matrix, merged = (str(tmp_path / f"{name}.json") for name in ("noise", "matrix", "merged"))
     code, output, _ = run("noise", "--dark", "dark/*.tif", "--flat", "flat_*/*.tif", *STATED, "--out", noise)
@@ -192,6 +193,7 @@ def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, ben
     assert run("check", good, *held_back, "--together", "red+violet=dark")[0] == 2
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_design_lists_the_best_set(run, tmp_path):
     rows = [f"{nm},{int(nm >= 600)},{int(500 <= nm < 600)},{int(nm < 500)}" for nm in range(400, 700, 10)]
     (tmp_path / "camera.csv").write_text("\n".join(["nm,R,G,B", *rows]))

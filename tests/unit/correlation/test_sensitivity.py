@@ -39,7 +39,7 @@ def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contra
     )
     estimate = Estimate(displacement=motion.displacement(mesh.nodes, SHAPE), rigid=np.zeros((1, 0)))
     residual = compare(problem, estimate)
-    found = BlockTable.of(residual, residual.weights, wide=True).together().sensitivity(mesh.nodes)
+    found = BlockTable.of(residual, residual.weights).together().sensitivity(mesh.nodes)
     np.testing.assert_allclose(found, contrast, atol=0.02)
 
 

@@ -91,4 +91,4 @@ def test_neighbours_whose_covariances_are_nearly_round_are_correlated() -> None:
     displacement = Displacement(unit="mm", values=np.zeros((3, COUNT)), std=std, covariance=covariance)
     mean = np.full(COUNT, 1 / COUNT)
     of_mean = np.diag(IN_SPACE.of_sums(mean[None], displacement))
-    np.testing.assert_allclose(of_mean, [IN_SPACE.variance(mean, error) for error in std], rtol=0.01)
+    np.testing.assert_allclose(of_mean, [IN_SPACE.variance(mean, one) for one in displacement.components], rtol=0.01)

@@ -124,7 +124,8 @@ def test_a_point_on_a_node_or_an_edge_needs_no_other_node() -> None:
 
 def test_between_nodes_the_stated_uncertainty_is_that_of_noise() -> None:
     weights = MeshPoints.of(MESH, POINTS).weights(ALL).toarray()
-    stated = np.sqrt(COVARIANCE.variance(weights, np.full(len(MESH.nodes), 1.0)))
+    one = np.ones(len(MESH.nodes))
+    stated = np.sqrt(COVARIANCE.variance(weights, Field(name="u", values=one, std=one)))
     np.testing.assert_allclose(stated, np.sqrt(np.diag(weights @ dense_correlation(MESH) @ weights.T)), rtol=0.02)
     assert 0.5 < stated.min() < stated.max() < 1.1
 

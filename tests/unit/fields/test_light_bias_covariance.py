@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, nodal_noise
 
-from rgbmidic.fields import Displacement, NodalCovariance, RigidMotion, StrainGauges, make_probe
+from rgbmidic.fields import Displacement, Field, NodalCovariance, RigidMotion, StrainGauges, make_probe
 from rgbmidic.mesh import Region, Tri3Mesh
 
 RANGE, DRAWS = 34.0, 300
@@ -45,7 +45,9 @@ def test_its_correlation_is_that_of_its_distance_in_px_of_the_image() -> None:
         in_mm = Tri3Mesh(nodes=0.05 * mesh.nodes, elements=mesh.elements)
         for found in (NodalCovariance.from_mesh(mesh), NodalCovariance.from_mesh(in_mm, mesh.nodes)):
             np.testing.assert_allclose((found.bias @ found.bias.T).toarray(), correlation(mesh.nodes), atol=0.01)
-            np.testing.assert_allclose(found.variance(np.eye(len(mesh.nodes)), 2.0, 1.0), 4.0)
+            one = np.ones(len(mesh.nodes))
+            field = Field(name="u", values=one, std=2 * one, bias=one)
+            np.testing.assert_allclose(found.variance(np.eye(len(mesh.nodes)), field), 4.0)
 
 
 @pytest.mark.parametrize("kind", PLACES)

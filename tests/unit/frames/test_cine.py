@@ -14,8 +14,8 @@ from real_files import RealData, count
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import ChannelFrame, FrameSource, Mosaic, open_series, open_source
-from rgbmidic.frames.cine import _LINEAR
 from rgbmidic.settings import FrameSettings
+from rgbmidic.tools.formats.cine import _LINEAR
 
 ANY = FrameSettings(path=("movie",))
 BEFORE_LEVELS, BEFORE_NS, BEFORE_COLOURS = 5732, 1568, 808

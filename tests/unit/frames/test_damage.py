@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mutations import WRITERS, mutated, read_all
 
-COPIES, CINE_COPIES = 60, 300
+COPIES, CINE_COPIES = 40, 150
 
 
 @pytest.mark.parametrize("name", WRITERS)

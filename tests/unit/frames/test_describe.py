@@ -18,9 +18,9 @@ from seq_files import write_seq
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import write_dng, write_tiff
 from rgbmidic.frames.data import Recording
-from rgbmidic.frames.series import describe, description_text, save_frame
 from rgbmidic.results import UNKNOWN_TIME
 from rgbmidic.settings import FrameSettings
+from rgbmidic.tools.lab.inspection.frame_files import describe, description_text, save_frame
 
 KEYS = [
     *("reader", "count", "shape", "cfa", "bit_depth", "black_level", "white_level"),

@@ -23,7 +23,7 @@ from rgbmidic.cli.command import execute
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import FrameFormat, FrameSource, StoredFrame, formats, open_series, open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
-from rgbmidic.frames.formats import FORMATS
+from rgbmidic.frames.formats import frame_formats
 from rgbmidic.settings import FrameSettings
 
 STATED = FrameSettings(path=("frame",))
@@ -382,7 +382,7 @@ def test_a_list_of_images_that_leads_back_to_itself_is_noticed(tmp_path: Path) -
 
 
 def test_every_ending_belongs_to_one_format() -> None:
-    endings = [ending for known in FORMATS for ending in known.endings if ending != ".raw"]
+    endings = [ending for known in frame_formats() for ending in (*known.endings, *known.movies) if ending != ".raw"]
     assert len(set(endings)) == len(endings)
 
 
@@ -527,6 +527,9 @@ level = FrameFormat(
 )
 
 
+NO_FORMAT = ()
+
+
 def test_formats_of_other_packages_join_by_an_entry_point(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -535,10 +538,10 @@ def test_formats_of_other_packages_join_by_an_entry_point(
 ) -> None:
     points = [
         EntryPoint(name=name, value=f"{__name__}:{what}", group=formats.ENTRY_POINTS)
-        for name, what in (("level", "level"), ("gone", "not_there"), ("other", "FORMATS"))
+        for name, what in (("level", "level"), ("gone", "not_there"), ("other", "NO_FORMAT"))
     ]
     monkeypatch.setattr(formats, "entry_points", lambda group: [one for one in points if one.group == group])
-    formats._plugin_formats.cache_clear()
+    formats._added_formats.cache_clear()
     try:
         for number in (7, 8):
             (tmp_path / f"{number}.level").write_text(str(number))
@@ -547,11 +550,11 @@ def test_formats_of_other_packages_join_by_an_entry_point(
         assert execute(cli.app, ["frames", "--formats"]) == 0
         listed = capsys.readouterr().out.splitlines()
         assert listed[-1] == "level files: .level"
-        assert len(listed) == len(FORMATS) + 1
+        assert len(listed) == len(frame_formats())
         warnings = [record.message for record in caplog.records]
         assert len(warnings) == 2
         assert "gone" in warnings[0]
         assert "not_there" in warnings[0]
         assert "it is a tuple, not a rgbmidic.frames.FrameFormat" in warnings[1]
     finally:
-        formats._plugin_formats.cache_clear()
+        formats._added_formats.cache_clear()

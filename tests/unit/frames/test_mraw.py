@@ -16,10 +16,10 @@ from real_files import RealData, count
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
-from rgbmidic.frames import movies as mraw
 from rgbmidic.frames.metadata import unpack_bits
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.settings import FrameSettings
+from rgbmidic.tools.formats import movies as mraw
 
 SHAPE = (12, 16)
 

@@ -18,16 +18,17 @@ from rgbmidic.illumination.colour_factors import (
     learn_texture,
 )
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.demosaicing import malvar_demosaic, reconstruct
-from rgbmidic.illumination.images import Registration, frame_geometry
-from rgbmidic.illumination.prediction_filters import (
+from rgbmidic.illumination.demosaicing import (
     DISSIMILAR,
     OFFSET_VARIANCE,
     SPARKLE_VARIANCE,
     WIDE,
     FilterTables,
-    Tiles,
+    filter_codes,
+    malvar_demosaic,
+    reconstruct,
 )
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.separation import demosaic, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.settings import BAYER_PATTERNS
@@ -152,8 +153,8 @@ OWN_LIGHT = np.eye(3)[list(CHANNEL)]
 def filters_at_rest(specific, texture):
     """Filters of one tile whose lights are not displaced."""
     still = np.zeros((3, 2, 1, 1))
-    tile = Tiles(specific=np.reshape(specific, (3, 1, 1)), noise=NOISE, displacement=still, glints=still)
-    return FilterTables().find(tile, texture, "RGGB", OWN_LIGHT)
+    code = filter_codes(np.reshape(specific, (3, 1, 1)), NOISE, still, still)
+    return FilterTables().find(code, texture, "RGGB", OWN_LIGHT)
 
 
 def test_filters_sum_to_one_and_follow_the_trust():
@@ -186,10 +187,8 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(by_le
     seen = np.array([[0.75, 0.25, 0], [0.05, 0.97, 0], [0.03, 0.95, 0], [0, 0.5, 0.5]])
     sparkle, of_channels = np.array([2.0**-10, 0.5, 2.0**-10]), channel_means(seen)
     grid = [part[:, :, None, None] for part in (by_lens, by_glints)]
-    tile = Tiles(
-        specific=sparkle.reshape(3, 1, 1), noise=np.full((3, 1, 1), noise), displacement=grid[0], glints=grid[1]
-    )
-    _, taps, _ = FilterTables().find(tile, texture, "RGGB", seen, left_out=left_out)
+    code = filter_codes(sparkle.reshape(3, 1, 1), np.full((3, 1, 1), noise), *grid)
+    _, taps, _ = FilterTables().find(code, texture, "RGGB", seen, left_out=left_out)
     offset, displacement = np.arange(size) - size // 2, by_lens + by_glints
     points = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
 
@@ -228,8 +227,8 @@ def test_filters_that_are_kept_are_those_made_anew():
     texture, tables, random = TextureModel.of_speckle(4.0), FilterTables(), np.random.default_rng(0)
     for _ in range(3):
         specific, still = 2.0 ** random.integers(-10, 3, (3, 4, 5)), np.zeros((3, 2, 4, 5))
-        tiles = Tiles(specific=specific, noise=np.full((3, 4, 5), 1e-3), displacement=still, glints=still)
-        kept, anew = (where.find(tiles, texture, "GRBG", OWN_LIGHT) for where in (tables, FilterTables()))
+        codes = filter_codes(specific, np.full((3, 4, 5), 1e-3), still, still)
+        kept, anew = (where.find(codes, texture, "GRBG", OWN_LIGHT) for where in (tables, FilterTables()))
         np.testing.assert_array_equal(kept[1][kept[0]], anew[1][anew[0]])
 
 
@@ -283,7 +282,7 @@ def test_lights_without_a_common_texture_are_taken_by_channel(mat):
     mosaic = scenes.mosaic_of(mat)
     texture = replace(reconstruct(mosaic, scenes.CROSSTALK).texture, common=False)
     model = reconstruct(mosaic, scenes.CROSSTALK, texture=texture)
-    np.testing.assert_array_equal(model.channels.values, malvar_demosaic(mosaic).values)
+    np.testing.assert_array_equal(model.predicted().values, malvar_demosaic(mosaic).values)
 
 
 def vars_of(model):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
-from rgbmidic._kernels import texture
+from rgbmidic._kernels import illumination, texture
 from rgbmidic.illumination.colour_factors import _channel_moments, _planes, interleave_bayer, upsample_rows
 from rgbmidic.illumination.demosaicing import red_position
 from rgbmidic.illumination.texture import lanczos_weights
@@ -126,3 +126,26 @@ def test_unknown_samples_get_what_the_others_tell():
     kriging.fill_unknown(padded, share, 0, 0, 2, out, unknown)
     assert unknown[5, 5]
     assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_black_is_subtracted_by_the_row(kind):
+    rng = np.random.default_rng(4)
+    samples, black = rng.integers(0, 200, (5, 7)).astype(kind), rng.uniform(0, 9, (2, 7)).astype(np.float32)
+    values, saturated = np.empty((5, 7), np.float32), np.empty((5, 7), bool)
+    illumination.subtract_black(samples, black, 150.0, values, saturated)
+    np.testing.assert_array_equal(values, samples.astype(np.float32) - black[np.arange(5) % 2])
+    np.testing.assert_array_equal(saturated, samples >= 150)
+
+
+def test_slopes_of_three_channels_and_what_each_has_of_its_own():
+    rng, crosstalk = np.random.default_rng(5), np.array([[1, 0.1, 0], [0.1, 1, 0.1], [0, 0.1, 1], [0.2, 0.3, 0.1]]).T
+    covariance, energy = rng.uniform(-0.1, 2, (3, 4, 5)), np.array([1.1, 0.9, 1.1])
+    variance, allowed = rng.uniform(1, 3, (3, 4, 5)), 0.03
+    to_lights, pairs = np.linalg.pinv(crosstalk**2), [(0, 1), (0, 2), (1, 2)]
+    to_pairs = np.stack([crosstalk[a] * crosstalk[b] for a, b in pairs])
+    square, specific = np.empty_like(variance), np.empty_like(variance)
+    sparkle = np.ascontiguousarray(to_lights)
+    illumination.common_slopes(variance, covariance, energy, allowed, sparkle, to_pairs, square, specific)
+    expected = naive_texture.common_slopes(variance, covariance, energy, allowed, to_lights, to_pairs)
+    np.testing.assert_allclose([square, specific], expected, rtol=1e-10)

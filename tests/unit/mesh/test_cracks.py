@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.tri3 import refine_elements
+from rgbmidic.tools.preparation.refinement import refine_elements
 
 SHAPE = (301, 401)
 SIZE = 25

@@ -51,37 +51,46 @@ def test_sums_of_products_of_two_fields(pixels):
     np.testing.assert_allclose(out, expected_sums(pixels, fields, 4), atol=1e-4)
 
 
-@pytest.mark.parametrize(("side", "sums"), [(4, 6), (13, 6), (13, 4)])
-def test_scores_of_all_lights_together_and_the_slopes_of_both_states(pixels, side, sums):
+@pytest.mark.parametrize(("side", "number"), [(4, 4), (13, 4), (13, 0)])
+def test_scores_of_each_light_and_the_slopes_of_both_states_together(pixels, side, number):
     random = np.random.default_rng(1)
-    residual, gx, gy, values, inverse = random.normal(size=(5, 3, pixels.rows.size)).astype(np.float32)
+    residual, gx, gy, own_x, own_y, values, inverse = random.normal(size=(7, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
-    out = np.full((sums, *pixels.grid(side)), 7, dtype=np.float32)
-    lines = pixels.lines, pixels.run_offsets, pixels.offsets
-    score_sums(residual, weight, gx, gy, values, inverse, *lines, side, out)
-    scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)
-    fields = [*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)]
+    out, common = (np.full((*n, *pixels.grid(side)), 7, dtype=np.float32) for n in ((3, 4), (number,)))
+    fields = residual, weight, gx, gy, own_x, own_y, values, inverse, np.empty((0, 2, 6), dtype=np.float32)
+    geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+    score_sums(*fields, *geometry, side, out, common)
+    scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2), weight > 0
+    expected = np.stack([expected_sums(pixels, light, side) for light in zip(*scores, strict=True)])
+    np.testing.assert_allclose(out, expected, atol=4e-4)
     element = np.repeat(np.arange(len(pixels.origin)), np.diff(pixels.offsets))
     slot = {place: n for n, place in enumerate(zip(element, pixels.rows, pixels.columns, strict=True))}
     f, slopes = values * inverse, np.zeros((2, residual.shape[1]))
     g = f - residual
+    first_row = {e: row for e, row, _ in reversed(slot)}
     for (e, row, column), a in slot.items():
+        if (row - first_row[e]) % 2:
+            continue
         for gradient, beside in ((gx, (e, row, column + 1)), (gy, (e, row + 1, column))):
             if (b := slot.get(beside)) is not None:
                 mean = (weight[:, a] * gradient[:, a] + weight[:, b] * gradient[:, b]) / 2
                 slopes[:, a] += mean @ (f[:, b] - f[:, a]), mean @ (g[:, b] - g[:, a])
-    np.testing.assert_allclose(out, expected_sums(pixels, [*fields, *slopes][:sums], side), atol=4e-4)
+    own = ((weight * residual * gradient).sum(axis=0) for gradient in (own_x, own_y))
+    np.testing.assert_allclose(common, expected_sums(pixels, [*own, *slopes], side)[:number], atol=4e-4)
 
 
 def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
     def found():
-        sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((6, *pixels.grid(4)), np.float32)
+        sums, common = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
+        summed = np.zeros((2, *common.shape), np.float32)
         product_sums(values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, sums)
-        score_sums(*[values] * 6, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed)
+        geometry = pixels.local_x, pixels.local_y, pixels.lines, pixels.run_offsets, pixels.offsets
+        polynomials = np.ones((len(pixels.origin), 2, 6), dtype=np.float32)
+        score_sums(*[values] * 8, polynomials, *geometry, 4, summed, common)
         blocks = pixels.block_sums(values, 5)
-        return sums, summed, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
+        return sums, summed, common, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
 
     assert_same_on_threads(found)
 

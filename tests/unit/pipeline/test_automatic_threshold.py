@@ -14,9 +14,9 @@ from rgbmidic.errors import FrameError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import linearise
 from rgbmidic.mesh import Region
-from rgbmidic.pipeline.automatic_threshold import automatic_threshold, automatic_weights
 from rgbmidic.settings import TestSettings
 from rgbmidic.tools.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
+from rgbmidic.tools.preparation.automatic_threshold import automatic_threshold, automatic_weights
 from rgbmidic.tools.scene.camera import reference_camera
 from rgbmidic.weights.threshold import FALLBACK, threshold_weights
 

@@ -11,7 +11,8 @@ from small_tests import SmallTest, colour_test
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields import Field, Units
-from rgbmidic.pipeline.batch import (
+from rgbmidic.results import Histories
+from rgbmidic.tools.batch import (
     Outcome,
     check_summary,
     modulus,
@@ -21,7 +22,6 @@ from rgbmidic.pipeline.batch import (
     summary_rows,
     write_summary,
 )
-from rgbmidic.results import Histories
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from rgbmidic.pipeline.frame_quality import (
     separation_doubts,
     speckle_size,
 )
-from rgbmidic.pipeline.source import SourceSeries
+from rgbmidic.pipeline.user_objects import SourceSeries
 from rgbmidic.settings import TestSettings
 from rgbmidic.tools.lab.inspection import inspect_frame
 

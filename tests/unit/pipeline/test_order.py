@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rgbmidic.pipeline.order import STRIDE, dependants, is_key, parent
+from rgbmidic.pipeline.engine import dependants, is_key, parent
+from rgbmidic.pipeline.plan import STRIDE
 
 
 def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_frame_before() -> None:

@@ -18,11 +18,13 @@ sys.path.append(str(Path(__file__).resolve().parents[3]))
 from benchmarks.resolution import SIZES, Scene
 from benchmarks.tables import FOLDER, Table
 from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError, RegionError
+from rgbmidic.extensions import PREPARATIONS
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
-from rgbmidic.pipeline.resolution import study_sizes
-from rgbmidic.pipeline.size_figures import ErrorFigures, ResolutionStudy, SizeFigures
+from rgbmidic.pipeline import Plan, measure, measure_sequence
 from rgbmidic.settings import MeshSettings, TestSettings
+from rgbmidic.tools.preparation import element_size as resolution
+from rgbmidic.tools.preparation.element_size import study_sizes
+from rgbmidic.tools.preparation.size_figures import ErrorFigures, ResolutionStudy, SizeFigures
 
 STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
 NOISE = np.random.default_rng(3).normal(scale=10, size=(5, *STATES[0].shape)).astype(np.float32)
@@ -154,7 +156,7 @@ def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypa
     assert "element_size" not in by_hand.provenance
 
     asked = []
-    monkeypatch.setattr("rgbmidic.pipeline.run.choose", lambda *a, **b: asked.append(a) or chosen)
+    monkeypatch.setitem(PREPARATIONS, "mesh.element_size", lambda: lambda *a, **b: asked.append(a) or chosen)
     parts = tmp_path / "parts"
     for part in (range(0, 2), range(2, 5)):
         last = measure(stated, parts, source=FRAMES, frames=part)
@@ -264,7 +266,7 @@ def test_a_run_refines_its_mesh_where_the_bump_is_and_goes_on_with_it(tmp_path, 
 
     others = measure(refining(), tmp_path / "others", source=BUMPS, workers=2)
     np.testing.assert_array_equal(others.u, whole.u)
-    monkeypatch.setattr("rgbmidic.pipeline.run.refine", lambda *a: pytest.fail("refined again"))
+    monkeypatch.setitem(PREPARATIONS, "mesh.refine", lambda: pytest.fail("refined again"))
     measure(refining(), tmp_path / "others", source=BUMPS, resume=True)
 
 

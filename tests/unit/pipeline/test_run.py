@@ -96,10 +96,10 @@ def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Dying(engine.Threads):
-        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.FrameOutcome]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[engine.Outcome]:
             if index != 5:
                 return super().submit(index, start, updated)
-            dead: Future[frame.FrameOutcome] = Future()
+            dead: Future[engine.Outcome] = Future()
             dead.set_exception(RuntimeError("the cluster gave up"))  # as distributed's KilledWorker
             return dead
 
@@ -158,7 +158,7 @@ def test_the_frames_of_chains_are_measured_in_step(
     order = list[int]()
 
     class Watching(engine.Threads):
-        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.FrameOutcome]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[engine.Outcome]:
             order.append(index)
             return super().submit(index, start, updated)
 
@@ -226,7 +226,7 @@ def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line_and_the_bits_a
     assert not [record for record in caplog.records if record.name.startswith("distributed")]
 
 
-@pytest.mark.parametrize("stop", [1, 13, 35])
+@pytest.mark.parametrize("stop", [13, 35])
 def test_an_interrupted_run_goes_on_to_the_same_bits(movie: Path, whole: Result, tmp_path: Path, stop: int) -> None:
     def interrupt(done: int, total: int, line: str) -> None:
         if done == stop:
@@ -362,7 +362,7 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
-        failed = frame.FrameOutcome(record=frame.failed_frame(plan, index, "out of memory"))
+        failed = (frame.failed_frame(plan, index, "out of memory"), None)
         return failed if index == 33 else frame.measure_frame_safely(plan, index, start, updated)
 
     with monkeypatch.context() as patched:
@@ -427,7 +427,7 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
     def watched(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
-        lost = frame.FrameOutcome(record=frame.failed_frame(plan, index, "lost"))
+        lost = (frame.failed_frame(plan, index, "lost"), None)
         return lost if index == 16 and len(starts) == 17 else frame.measure_frame_safely(plan, index, start, updated)
 
     monkeypatch.setattr("rgbmidic.pipeline.engine.measure_frame_safely", watched)

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from results import LIGHTS, NODES, make_origin, make_result
+from results import LIGHTS, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import (
@@ -85,6 +85,23 @@ def test_an_unknown_time_is_left_out_of_csv_and_nan_in_npz(tmp_path: Path) -> No
     assert "time" not in (tmp_path / "fields.csv").read_text(encoding="utf-8")
     export_result(Result.open(tmp_path / "out"), "npz", tmp_path / "fields.npz")
     assert np.isnan(np.load(tmp_path / "fields.npz")["time_s"]).all()
+
+
+def test_only_measured_frames_are_exported_with_their_times(tmp_path: Path) -> None:
+    with ResultStore.create(tmp_path / "out", make_origin(4)) as store:
+        with pytest.raises(InputError, match=r"no frame of .*out is measured yet"):
+            export_result(Result.open(store.path, partial=True), "csv", tmp_path / "a.csv")
+        for index in (0, 3):
+            store.write_frame(index, random_record(index))
+        result = Result.open(store.path, partial=True)
+    export_result(result, "csv", tmp_path / "a.csv")
+    times = {row["frame"]: row["time_s"] for row in read_csv(tmp_path / "a.csv")}
+    assert times == {"0": "0", "3": "0.003000009"}
+    export_result(result, "hdf5", tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["name"].asstr()[...].tolist() == ["frame 0", "frame 3"]
+        np.testing.assert_allclose(file["time"], [0, 3.000009e-3])
+        np.testing.assert_array_equal(file["u"], result.u[[0, 3]])
 
 
 def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from results import MESH, NODES, make_origin, make_result
+from results import MESH, NODES, make_origin, make_result, smooth_record
 
 from rgbmidic.cli import app as cli
 from rgbmidic.cli.command import execute
@@ -33,10 +33,12 @@ from rgbmidic.results import (
     Origin,
     Result,
     ResultStore,
+    frame_times,
     history_rows,
     write_histories,
 )
 from rgbmidic.results.histories import history_csv, read_histories, with_channels
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
@@ -226,6 +228,56 @@ def test_a_stated_rate_that_is_not_that_of_the_camera_is_told(tmp_path: Path, ca
     found = read(result, points=(PLACE,), scale=ScaleSettings(frame_rate=500.0))
     assert "states 500 frames per second, the camera was set to 1000: the former is taken" in caplog.text
     np.testing.assert_allclose(found.times, np.array(NUMBERS) / 500)
+
+
+def timed_record(number: int, time_ns: int, *, failed: bool = False) -> FrameRecord:
+    """Of a frame that was measured, or could not be read."""
+    if failed:
+        return FrameRecord.failed("gone", nodes=NODES, lights=3, number=number, time_ns=time_ns)
+    return replace(record := smooth_record(number), values={**record.values, "time_ns": time_ns})
+
+
+@pytest.mark.parametrize(
+    ("stamps", "problem"),
+    [
+        ((0, 10, 10, 30), "frame 2 is not later"),
+        ((0, 20, 10, 30), "frame 2 is not later"),
+        ((0, None, 20, 30), "frame 1 has none"),
+    ],
+)
+def test_time_stamps_that_do_not_rise_or_are_missing_are_not_used(
+    stamps: tuple[int | None, ...], problem: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def record(number: int) -> FrameRecord:
+        stamp = stamps[number]
+        return timed_record(number, UNKNOWN_TIME if stamp is None else stamp * 1_000_000)
+
+    result = make_result(tmp_path / "out", frames=4, record=record)
+    assert frame_times(result) is None
+    assert f"the time stamps of the frames are not used: {problem}" in caplog.text
+    np.testing.assert_allclose(frame_times(result, ScaleSettings(frame_rate=50.0)), np.arange(4) / 50)
+    assert not ResultInUnits.from_result(result).units.timed
+
+
+def test_a_frame_that_cannot_be_read_takes_no_time_from_the_others(tmp_path: Path) -> None:
+    """Its own follows from its number, between the others and beyond them."""
+
+    def record(number: int) -> FrameRecord:
+        lost = number in (2, 5)
+        return timed_record(number, UNKNOWN_TIME if lost else 7 * number, failed=lost)
+
+    times = frame_times(make_result(tmp_path / "out", frames=6, record=record))
+    assert times is not None
+    np.testing.assert_allclose(times, 7e-9 * np.arange(6))
+
+
+def test_late_times_are_written_with_the_digits_that_tell_them_apart(tmp_path: Path) -> None:
+    hours = 200_000 * 10**9
+    result = make_result(tmp_path / "out", frames=3, record=lambda i: timed_record(i, hours + 20_000 * i))
+    file = io.BytesIO()
+    history_csv(read(result, points=(PLACE,)), file)
+    rows = csv.DictReader(io.StringIO(file.getvalue().decode()))
+    assert [row["time_s"] for row in rows] == ["200000", "200000.00002", "200000.00004"]
 
 
 def test_motion_within_the_exposure_is_told_where_it_blurs(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
-from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.plane_samples import Frame
@@ -36,6 +35,7 @@ from rgbmidic.tools.lab.inspection.channels import (
 from rgbmidic.tools.lab.inspection.lamps import LampBalance
 from rgbmidic.tools.lab.inspection.prediction import Prediction, predict, separate_with_errors
 from rgbmidic.tools.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
+from rgbmidic.tools.preparation.frame_check import check_state
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, ProgressCallback
 
 

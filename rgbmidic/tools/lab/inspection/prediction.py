@@ -27,10 +27,9 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.colour_factors import BLOCK, CHANNEL, MEAN_BLOCK, MIN_SPECIFIC, upsample
 from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
-from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
+from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction, reconstruct
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -244,7 +243,7 @@ def _draw_sites(model: Reconstruction, strength: FloatArray, random: np.random.G
     Every light shows the texture where the registration says that it does, and a component of its own.
     """
     factors, texture, sites = model.factors, model.texture, model.model
-    shape = model.channels.values.shape[1:]
+    shape = model.mosaic.values.shape
     displacement = upsample(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
     margin = int(np.ceil(np.abs(displacement).max())) + 2
     common = gaussian_field(texture, (shape[0] + 2 * margin, shape[1] + 2 * margin), random)
@@ -254,7 +253,7 @@ def _draw_sites(model: Reconstruction, strength: FloatArray, random: np.random.G
     typical = median_filter(factors.light_specific - MIN_SPECIFIC, size=size, mode="reflect")
     deviation = np.sqrt(upsample(np.maximum(typical, 0), BLOCK, shape))
     slope = upsample(_smooth_blocks(factors.light_slope, BLOCK), BLOCK, shape)
-    mean = upsample(_smooth_blocks(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    mean = upsample(_smooth_blocks(model.moments.channel_mean, MEAN_BLOCK), MEAN_BLOCK, shape)
     response = sites.sites * strength
     # each green sees the lights' means in its own proportion
     response_beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)

@@ -18,12 +18,12 @@ import numpy.typing as npt
 
 from rgbmidic._version import __version__
 from rgbmidic.arguments import checked
+from rgbmidic.disk import write_errors
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.plane_samples import Frame
-from rgbmidic.results.files import write_errors
 from rgbmidic.tools.lab.virtual.rendering import render
 from rgbmidic.tools.scene.camera import Camera, Light, SecondCamera, green_signs, mosaic_samples
 from rgbmidic.tools.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene

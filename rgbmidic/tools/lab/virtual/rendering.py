@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.special import erf
 
-from rgbmidic._kernels.render import trace_rows
 from rgbmidic.arguments import checked
 from rgbmidic.tools.scene.camera import DISTANCE, NOMINAL_DISTANCE, PIXEL, Light, Vector, reference_camera, three_lights
+from rgbmidic.tools.scene.kernels import trace_rows
 from rgbmidic.tools.scene.scene import Plate, Scene, Sphere, State
 from rgbmidic.tools.scene.surface import AffineField, Finish, Surface
 from rgbmidic.tools.scene.zones import material_points, truth

@@ -79,6 +79,7 @@ def test_a_field_has_one_name_and_one_unit(result: Result, scale: ScaleSettings 
             assert (data[name].attrs["units"], data.x.attrs["units"]) == (field.unit, length)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: Result, tmp_path: Path) -> None:
     scale = ScaleSettings(mm_per_pixel=0.05)
     probes = ProbeSettings(points=((50.0, 40.0),), strain_gauges=((50.0, 40.0, 60.0),))

@@ -216,7 +216,7 @@ def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
 
     async def leave() -> None:
         server, address = start_server(make_result(tmp_path / "result").path)
-        for _ in range(3):
+        for _ in range(2):
             await AsyncHTTPClient().fetch(address)
         for session in server.get_sessions():
             session.request_expiration()
@@ -228,4 +228,4 @@ def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
         server.stop()
 
     asyncio.run(leave())
-    assert set(left) >= {0, 1, 2}  # Python 3.13 also wakes before the first is let go
+    assert set(left) >= {0, 1}  # Python 3.13 also wakes before the first is let go

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.picture import paint_field
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.tools.report.kernels import paint_field
 
 MESH = Tri3Mesh.from_region(Region.from_rectangle((3, 2, 40, 30), (34, 46)), 9)
 

@@ -23,8 +23,15 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import prepared_frame
 from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
+from rgbmidic.tools.preparation.size_figures import (
+    CONSTANTS,
+    Choice,
+    ErrorFigures,
+    GaugeFigures,
+    ResolutionStudy,
+    SizeFigures,
+)
 from rgbmidic.typing import FloatArray, ProgressCallback
 
 logger = logging.getLogger(__name__)

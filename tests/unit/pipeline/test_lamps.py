@@ -7,8 +7,8 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic.correlation import Reference
-from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.lamps import LampLight
 
 SHAPE = (160, 200)
 MOTION = Affine.strain_and_rotation(0.003, 0.3, (5.3, -3.6))
@@ -35,7 +35,7 @@ def displacement(prepared: Reference) -> np.ndarray:
 def test_gain_and_offset_are_found_where_the_surface_has_moved_to(gain, offset):
     first, second = states(gain, offset)
     prepared = reference(first)
-    found = brightness_change(first, second, prepared, displacement(prepared))
+    found = LampLight.of(first, prepared).change(second, displacement(prepared))
     # positions are rounded to whole pixels: elements differ, their median hardly
     assert found[0, 0] == pytest.approx(gain, rel=0.02)
     assert found[0, 1] == pytest.approx(offset, abs=0.02 * float(first[0].mean()))
@@ -45,7 +45,7 @@ def test_a_light_that_is_off_has_no_gain():
     first, second = states(1.0, 0.0)
     second[1] = np.random.default_rng(1).normal(0, 3, SHAPE)
     prepared = reference(first)
-    found = brightness_change(first, second, prepared, displacement(prepared))
+    found = LampLight.of(first, prepared).change(second, displacement(prepared))
     assert found[0, 0] == pytest.approx(1, rel=0.02)
     assert found[1, 0] < 0.094
 
@@ -56,7 +56,7 @@ def test_what_is_not_seen_in_both_states_is_left_out_and_nothing_gives_nan():
     motion = displacement(prepared)
     second[0, :, :100] = np.nan
     motion[motion[:, 0] > np.quantile(motion[:, 0], 0.9)] = np.nan
-    assert brightness_change(first, second, prepared, motion)[0, 0] == pytest.approx(0.9, rel=0.02)
-    assert np.isnan(brightness_change(first, np.full_like(second, np.nan), prepared, motion)).all()
-    assert np.isnan(brightness_change(first, second, prepared, np.full_like(motion, np.nan))).all()
-    assert np.isnan(brightness_change(first, second, prepared, motion + 1000)).all()
+    assert LampLight.of(first, prepared).change(second, motion)[0, 0] == pytest.approx(0.9, rel=0.02)
+    assert np.isnan(LampLight.of(first, prepared).change(np.full_like(second, np.nan), motion)).all()
+    assert np.isnan(LampLight.of(first, prepared).change(second, np.full_like(motion, np.nan))).all()
+    assert np.isnan(LampLight.of(first, prepared).change(second, motion + 1000)).all()

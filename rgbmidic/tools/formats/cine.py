@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import FrameError, damaged_file
 from rgbmidic.frames.data import SECOND, Recording
-from rgbmidic.frames.metadata import MovieHeader, StoredFrame, check_size, damaged_file, truncated_file, unpack_bits
+from rgbmidic.frames.metadata import MovieHeader, StoredFrame, check_size, truncated_file, unpack_bits
 from rgbmidic.frames.source import MovieSource, cache_by_file
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray

@@ -24,9 +24,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import FrameError, damaged_file
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, parse_fraction
-from rgbmidic.frames.metadata import EvenFrames, StoredFrame, damaged_file
+from rgbmidic.frames.metadata import EvenFrames, StoredFrame
 from rgbmidic.frames.source import MovieSource, cache_by_file
 
 logger = logging.getLogger(__name__)

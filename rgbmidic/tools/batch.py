@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.disk import check_file, require_regular_file, write_complete, write_table
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, common_variance_fraction
-from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
-from rgbmidic.settings import TestSettings, read_test, read_toml, require_regular_file
+from rgbmidic.settings import TestSettings, read_test, read_toml
 from rgbmidic.typing import ProgressCallback
 
 logger = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.errors import FrameError
-from rgbmidic.frames.metadata import EvenFrames, StoredFrame, check_size, damaged_file
+from rgbmidic.errors import FrameError, damaged_file
+from rgbmidic.frames.metadata import EvenFrames, StoredFrame, check_size
 from rgbmidic.frames.source import FrameSource
 
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+([0-9]{1,9})(?:\s|#[^\n]*\n)+([0-9]{1,9})(?:\s|#[^\n]*\n)+([0-9]{1,5})\s")

@@ -16,10 +16,10 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import check_state, contradictions
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.plane_samples import unevenness
 from rgbmidic.pipeline import measure
+from rgbmidic.tools.preparation.frame_check import check_state, contradictions
 
 BLACK, WHITE, SHAPE = 64, 4095, (288, 288)
 CALIBRATION = Calibration(crosstalk=CROSSTALK, noise=NOISE, unevenness=0.0)
