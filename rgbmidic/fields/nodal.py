@@ -48,6 +48,13 @@ class CalibrationErrors:
         Of the places of the nodes.
     gain : ndarray, shape (M, c, c, n)
         Of each component of a displacement, over each component of it: nothing of what does not move.
+
+    Examples
+    --------
+    >>> scale = 1e-3 * np.eye(3)[None, :, :, None]  # all lengths are off by a thousandth: one cause, one node
+    >>> errors = CalibrationErrors(surface=np.zeros((1, 3, 1)), gain=scale)
+    >>> errors.at_nodes(np.array([[2.0], [0.0], [-1.0]])).ravel().tolist()
+    [0.002, 0.0, -0.001]
     """
 
     surface: FloatArray

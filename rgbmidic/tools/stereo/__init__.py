@@ -13,7 +13,7 @@ from rgbmidic.tools.stereo.result import StereoResult
 from rgbmidic.tools.stereo.run import StereoSettings, measure_stereo, measure_stereo_part
 from rgbmidic.tools.stereo.shape import Shape
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES
-from rgbmidic.tools.stereo.surface import SurfaceGauges, SurfaceStrain
+from rgbmidic.tools.stereo.surface import attitude, displacement_in_space
 from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
 
 __all__ = [
@@ -27,10 +27,10 @@ __all__ = [
     "Shape",
     "StereoResult",
     "StereoSettings",
-    "SurfaceGauges",
-    "SurfaceStrain",
     "Triangulation",
+    "attitude",
     "carry_mesh",
+    "displacement_in_space",
     "lens_matrix",
     "measure_stereo",
     "measure_stereo_part",

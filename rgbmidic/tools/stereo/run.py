@@ -203,7 +203,7 @@ def measure_stereo(
         "axes": shape.axes.description,
         "axes_origin_mm": shape.axes.origin,
         "axes_rotation": shape.axes.rotation,
-        "gauge_px": shape.gauges.gauges.length,
+        "gauge_px": shape.gauges.length,
         "measure": settings.measure,
         "relative_length_std": shape.calibration.length_std,
         "common_variance_fraction": common_variance_fraction(first),

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.results import Result
 from rgbmidic.tools.stereo.axes import Axes, AxesChoice
 from rgbmidic.tools.stereo.calibration_part import CalibrationPart
 from rgbmidic.tools.stereo.camera_pair import CameraPair
 from rgbmidic.tools.stereo.carried_mesh import CarriedMesh
-from rgbmidic.tools.stereo.surface import SurfaceGauges
+from rgbmidic.tools.stereo.surface import attitude, displacement_in_space
 from rgbmidic.tools.stereo.triangulation import Triangulation, triangulate
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -63,7 +64,7 @@ class Shape:
         In which results are.
     points, covariance : ndarray, shapes (N, 3) and (N, 3, 3)
         The surface in these axes, mm, and its covariance by the match of the references and the calibration.
-    gauges
+    gauges, measure
         Of the surface strain.
     calibration
         The part of the calibration.
@@ -75,7 +76,8 @@ class Shape:
     axes: Axes
     points: FloatArray
     covariance: FloatArray
-    gauges: SurfaceGauges
+    gauges: StrainGauges
+    measure: str
     calibration: CalibrationPart
 
     @classmethod
@@ -122,6 +124,8 @@ class Shape:
         axes_in_space = Axes.of(axes, carried_mesh.left, shape.points)
         points = axes_in_space.points(shape.points)
         calibration = CalibrationPart.of(pair, carried_mesh.left, shape, axes)
+        nodal = NodalCovariance.from_mesh(carried_mesh.left)
+        nodal = replace(nodal, surface=points, calibration=calibration.errors)
         return cls(
             pair=pair,
             carried_mesh=carried_mesh,
@@ -129,7 +133,8 @@ class Shape:
             axes=axes_in_space,
             points=points,
             covariance=axes_in_space.covariance(shape.covariance) + _covariance_of(calibration.errors.surface),
-            gauges=SurfaceGauges.around_nodes(carried_mesh.left, points, calibration.errors, gauge, measure),
+            gauges=StrainGauges.at_nodes(nodal, gauge),
+            measure=measure,
             calibration=calibration,
         )
 
@@ -160,17 +165,17 @@ class Shape:
         covariance = self.axes.covariance(deformed.covariance)
         gain = self.axes.rotation @ deformed.gain
         bias = np.sqrt(np.einsum("nij,nj->ni", gain**2, np.nan_to_num(np.concatenate(biases, axis=1)) ** 2))
-        surface = self.gauges.strain(displacement, covariance)
-        strain = surface.strain
+        field = displacement_in_space(displacement.T, np.moveaxis(covariance, 0, 2))
+        strain, (normal, tilt) = self.gauges.strain(field, self.measure), attitude(self.gauges, field)
         covariance = covariance + _covariance_of(self.calibration.errors.at_nodes(displacement.T))
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         values: dict[str, AnyArray] = {
             "displacement_covariance": covariance,
             "epipolar_change": deformed.residual - reference.residual,
             "epipolar_change_std": deformed.residual_std,
-            "normal": surface.normal,
-            "tilt": surface.tilt,
-            "tilt_std": surface.tilt_std,
+            "normal": normal,
+            "tilt": tilt.values,
+            "tilt_std": tilt.uncertainty,
             "left_status": np.asarray(left["node_status"]),
             "right_status": np.asarray(right["node_status"]),
         }

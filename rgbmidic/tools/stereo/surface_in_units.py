@@ -23,6 +23,7 @@ from rgbmidic.results.quantities import derived_quantities, stored_map_quantitie
 from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.tools.stereo.stereo_file import QUANTITIES
+from rgbmidic.tools.stereo.surface import displacement_in_space
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ _SPACE: dict[str, Literal["displacement", "strain"]] = {
 """Quantities of the file, with their standard uncertainty, that maps show as they are, with their kinds."""
 _BIASES = ("u_bias_std", "v_bias_std", "w_bias_std")
 _ROUNDING = 1e-6
-"""Part of a variance that is left at least where the calibration's is taken off it: single precision (derived)."""
+"""Part of a variance that is added where the calibration's is taken off it: single precision (derived)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,16 +149,8 @@ class SurfaceInUnits(ResultInUnits):
         arrays = self.result.stereo.frame([*self.components, "displacement_covariance", *_BIASES], frame)
         values, bias = (np.stack([arrays[name] for name in names]) for names in (self.components, _BIASES))
         total, errors = np.moveaxis(arrays["displacement_covariance"], 0, 2), self._errors.at_nodes(values)
-        covariance = total - np.einsum("min,mjn->ijn", errors, errors)
-        std = np.sqrt(np.maximum(np.einsum("iin->in", covariance), _ROUNDING * np.einsum("iin->in", total)))
-        return Displacement(
-            unit="mm",
-            dims=("component", "node"),
-            values=values,
-            std=std,
-            bias=np.minimum(bias, std),
-            covariance=covariance,
-        )
+        covariance = total * (1 + _ROUNDING * np.eye(3)[..., None]) - np.einsum("min,mjn->ijn", errors, errors)
+        return displacement_in_space(values, covariance, bias)
 
     def field(self, name: str, frame: int) -> Field:
         """Read one of the `quantities` with its standard uncertainty in a frame."""

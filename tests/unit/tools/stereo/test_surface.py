@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stereo_scene import DISTANCE, Motion
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.errors import InputError
-from rgbmidic.tools.stereo import Axes, SurfaceGauges
+from rgbmidic.fields import NodalCovariance, StrainGauges
+from rgbmidic.tools.stereo import Axes, attitude, displacement_in_space
 
 MESH = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 120, 90), shape=(100, 130)), 15)
 MATERIAL = (MESH.nodes - MESH.nodes.mean(axis=0)) * 0.2
@@ -16,9 +19,12 @@ REST = Motion().points(MATERIAL)
 EXACT = np.zeros((len(REST), 3, 3))
 
 
-def strain_of(motion, points=REST, covariance=EXACT, **changes):
-    gauges = SurfaceGauges.around_nodes(MESH, points, **changes)
-    return gauges.strain(motion.points(MATERIAL) - REST, covariance)
+def gauges_on(points=REST, length=None):
+    return StrainGauges.at_nodes(replace(NodalCovariance.from_mesh(MESH), surface=points), length)
+
+
+def moved(displacement, covariance=EXACT):
+    return displacement_in_space(displacement.T, np.moveaxis(covariance, 0, 2))
 
 
 def tilt_of(motion):
@@ -28,9 +34,9 @@ def tilt_of(motion):
 
 def test_a_rigid_motion_strains_nothing():
     motion = Motion(degrees=(20.0, -35.0, 50.0), translation=(3.0, 2.0, -9.0))
-    surface = strain_of(motion)
-    assert np.abs(surface.strain.components).max() < 1e-12
-    assert surface.tilt == pytest.approx(tilt_of(motion), abs=1e-6)
+    displacement = moved(motion.points(MATERIAL) - REST)
+    assert np.abs(gauges_on().strain(displacement).components).max() < 1e-12
+    assert attitude(gauges_on(), displacement)[1].values == pytest.approx(tilt_of(motion), abs=1e-6)
 
 
 @pytest.mark.parametrize("measure", ["green-lagrange", "biot"])
@@ -39,9 +45,8 @@ def test_a_stretch_of_a_plate_that_turns_is_exact(measure):
     stretch = np.array([[1.02, 0.0], [0.01, 0.99]])
     axes = Axes.of("plane", MESH, REST)
     motion = Motion(stretch=tuple(map(tuple, stretch)), degrees=(5.0, 9.0, -20.0))
-    gauges = SurfaceGauges.around_nodes(MESH, axes.points(REST), measure=measure)
-    surface = gauges.strain((motion.points(MATERIAL) - REST) @ axes.rotation.T, EXACT)
-    strain, normal = surface.strain, surface.normal
+    gauges, displacement = gauges_on(axes.points(REST)), moved((motion.points(MATERIAL) - REST) @ axes.rotation.T)
+    strain, (normal, _) = gauges.strain(displacement, measure), attitude(gauges, displacement)
     along = axes.rotation @ Motion().attitude[:, :2]  # the material's axes in those of the result
     c = along[:2] @ (stretch.T @ stretch) @ along[:2].T
     values, vectors = np.linalg.eigh(c)
@@ -53,30 +58,29 @@ def test_a_stretch_of_a_plate_that_turns_is_exact(measure):
 def test_noise_of_nodes_that_are_correlated_as_those_of_a_fit_is_stated():
     random, ratios, tilts = np.random.default_rng(0), [], []
     motion = Motion(degrees=(1, 2, 3))
-    gauges = SurfaceGauges.around_nodes(MESH, REST, length=70.0)
-    from rgbmidic.fields import NodalCovariance
-
+    gauges = gauges_on(length=70.0)
     fit = NodalCovariance.from_mesh(MESH).fit
     root = np.diag([1e-3, 2e-3, 5e-3])
     covariance = np.tile(root @ root.T, (len(REST), 1, 1))
     for _ in range(60):
         noise = fit @ random.normal(size=(fit.shape[1], 3)) @ root.T
-        surface = gauges.strain(motion.points(MATERIAL) - REST + noise, covariance)
-        ratios.append(surface.strain.components / surface.strain.components_std)
-        tilts.append((surface.tilt - tilt_of(motion)) / surface.tilt_std)
+        displacement = moved(motion.points(MATERIAL) - REST + noise, covariance)
+        strain, (_, tilt) = gauges.strain(displacement), attitude(gauges, displacement)
+        ratios.append(strain.components / strain.components_std)
+        tilts.append((tilt.values - tilt_of(motion)) / tilt.std)
     assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(1, abs=0.1)
     assert np.sqrt(np.mean(np.square(ratios), axis=(0, 1))) == pytest.approx(1, abs=0.1)
 
 
 def test_a_node_without_data_leaves_its_gauge_without():
-    gauges = SurfaceGauges.around_nodes(MESH, REST)
+    gauges = gauges_on()
     displacement = np.zeros_like(REST)
     displacement[10] = np.nan
-    surface = gauges.strain(displacement, EXACT)
-    assert np.isnan(surface.strain.components[10]).all()
-    assert np.isnan(surface.normal[10]).all()
-    assert np.isnan(surface.tilt[10])
-    assert np.isfinite(surface.strain.components).any()
+    strain, (normal, tilt) = gauges.strain(moved(displacement)), attitude(gauges, moved(displacement))
+    assert np.isnan(strain.components[10]).all()
+    assert np.isnan(normal[10]).all()
+    assert np.isnan(tilt.values[10])
+    assert np.isfinite(strain.components).any()
 
 
 def test_axes():
