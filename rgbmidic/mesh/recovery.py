@@ -187,8 +187,9 @@ def quadratic_fit(
 def _relative_information(mesh: Tri3Mesh, active: BoolArray, information: FloatArray) -> FloatArray:
     """Factor (M,) on the weights of the nodes around each, in the order of `_Ways`, by the elements' information.
 
-    It is that of both nodes' variances, times the square of what the widest way between them has over what the node
-    has: the way is over one or two edges, an edge is as wide as the better of its elements, a way as its narrower edge.
+    It is that of both nodes' variances, times the square of what twice the widest way between them has over what the
+    node has, 1 at most: a way is over one or two edges, an edge is as wide as the better of its elements, a way as its
+    narrower edge. Twice: elements differ by chance, by as many speckles as they hold.
     """
     ways, area = mesh.derive(_ways, active.tobytes()), mesh.areas * active
     nodal = mesh.to_nodes(information * area) / np.maximum(mesh.to_nodes(area), 1e-300)
@@ -199,7 +200,7 @@ def _relative_information(mesh: Tri3Mesh, active: BoolArray, information: FloatA
     row = np.repeat(np.arange(len(nodal)), np.diff(structure.indptr))
     node, neighbour = nodal[row], nodal[structure.indices]
     by_node = np.divide(neighbour, node + neighbour, out=np.full(row.size, 0.5), where=node + neighbour > 0)
-    by_way = np.divide(np.minimum(widest, node), node, out=np.ones(row.size), where=node > 0)
+    by_way = np.divide(np.minimum(2 * widest, node), node, out=np.ones(row.size), where=node > 0)
     return np.asarray(by_node * by_way**2)
 
 

@@ -168,5 +168,5 @@ def test_nodes_are_reached_over_the_widest_way():
         way = max((min(edges[node, k], edges.get((k, neighbour), 0)) for k in beside), default=np.inf)
         expected = 0.5
         if nodal[node] > 0:
-            expected = nodal[neighbour] / (nodal[node] + nodal[neighbour]) * min(1, way / nodal[node]) ** 2
+            expected = nodal[neighbour] / (nodal[node] + nodal[neighbour]) * min(1, 2 * way / nodal[node]) ** 2
         assert factor == pytest.approx(expected)
