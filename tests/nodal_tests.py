@@ -21,7 +21,7 @@ STD = 0.01
 def dense_correlation(mesh: Tri3Mesh) -> FloatArray:
     """Correlation (N, N) between nodes by dense algebra: the linear fit's, carried through the recovery."""
     everywhere = np.ones(len(mesh.elements), dtype=bool)
-    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value.toarray()
+    recovery = Recovery.over(mesh, everywhere).value.toarray()
     covariance = recovery @ np.linalg.inv(mesh.mass_matrix.toarray()) @ recovery.T
     unit = np.sqrt(np.diag(covariance))
     return covariance / unit / unit[:, None]

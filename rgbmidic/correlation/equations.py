@@ -152,8 +152,8 @@ class Equations:
         return np.asarray(self.observability > 1)
 
     def information(self) -> FloatArray:
-        """Return texture times weight around each node, over its area, (N,): proportional to the inverse variance."""
-        return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / self.reference.assembly.nodal_area)
+        """Return texture times weight in each element, over its area, (E,): proportional to the inverse variance."""
+        return np.asarray(np.einsum("eaad->ed", self.blocks)[:, ::2].sum(axis=1) / self.reference.mesh.areas)
 
     def increment(
         self, right_side: FloatArray, held_side: FloatArray, rigid_side: FloatArray

@@ -163,7 +163,7 @@ def _boundary_fits(mesh: Tri3Mesh, active: bytes) -> _BoundaryFits:
     departure = np.where(
         edge[nodes, None] & (angle > _CONSTANTS.angle), _fits(weight, basis)[:, 0] - (neighbours == nodes[:, None]), 0
     )
-    recovery, required = Recovery.over(mesh, elements, np.ones(count)), np.zeros((2, count), dtype=bool)
+    recovery, required = Recovery.over(mesh, elements), np.zeros((2, count), dtype=bool)
     required[0, reach.indices] = required[1, nodes] = True
     missed = [
         _recovered_cubics(mesh, operator, required[min(order, 1)])

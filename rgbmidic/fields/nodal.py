@@ -169,7 +169,7 @@ class NodalCovariance:
         mass = mesh.mass_matrix
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
         everywhere = np.ones(len(mesh.elements), dtype=bool)
-        recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
+        recovery = Recovery.over(mesh, everywhere).value
         fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
         return cls(mesh=mesh, fit=unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
 

@@ -100,8 +100,10 @@ class Recovery:
     offset: FloatArray
 
     @classmethod
-    def over(cls, mesh: Tri3Mesh, active: BoolArray, information: FloatArray, first: int | None = None) -> Recovery:
-        """Over the elements `active` (E,) of a mesh; `information` (N,) and `first` as in `quadratic_fit`."""
+    def over(
+        cls, mesh: Tri3Mesh, active: BoolArray, information: FloatArray | None = None, first: int | None = None
+    ) -> Recovery:
+        """Over the elements `active` (E,) of a mesh; `information` (E,) and `first` as in `quadratic_fit`."""
         offset = mesh.linear_fit_offset
         operators = quadratic_fit(mesh, active, information=information, offset=offset, first=first)
         value, slope_x, slope_y, *curvature = operators
@@ -149,8 +151,10 @@ def quadratic_fit(
         N nodes, E elements.
     active : ndarray, shape (E,), bool
         Elements over which nodes are reached.
-    information : ndarray, shape (N,), optional
-        How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
+    information : ndarray, shape (E,), optional
+        What an element shows of the displacement, per area (inverse variance, any unit); None: all alike. A node that
+        is known badly counts little elsewhere, and so does one that is reached only over elements that show little
+        beside what a node knows: they may hide a step.
     offset : ndarray, shape (N, 3), optional
         Excess of the given values over a field whose second derivative xx, xy or yy is 1, square px; 0 without.
     first
@@ -163,18 +167,12 @@ def quadratic_fit(
     """
     neighbours, entries, weight, structure = mesh.derive(_window, active.tobytes())
     basis = mesh.derive(_basis, active.tobytes(), None if offset is None else offset.tobytes())
+    if information is not None:
+        weight = weight.copy()
+        weight.ravel()[entries] *= _relative_information(mesh, active, information)
     if first is not None:
         neighbours, weight, basis, structure = neighbours[:first], weight[:first], basis[:first], structure[:first]
         entries = entries[: structure.nnz]
-    if information is not None:
-        node_information = np.broadcast_to(information[: len(neighbours), None], neighbours.shape)
-        neighbour_information = information[neighbours]
-        weight = weight * np.divide(
-            neighbour_information,
-            node_information + neighbour_information,
-            out=np.full(neighbours.shape, 0.5),
-            where=node_information + neighbour_information > 0,
-        )
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     # slopes and curvatures are held at 0 where too few nodes determine them: the second derivatives of waves of 5 to 6
@@ -184,6 +182,26 @@ def quadratic_fit(
         np.linalg.inv(normal) / (mesh.sizes[: len(neighbours), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
     ) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[entries]) for term in range(6))
+
+
+def _relative_information(mesh: Tri3Mesh, active: BoolArray, information: FloatArray) -> FloatArray:
+    """Factor (M,) on the weights of the nodes around each, in the order of `_Ways`, by the elements' information.
+
+    It is that of both nodes' variances, times the square of what twice the widest way between them has over what the
+    node has, 1 at most: a way is over one or two edges, an edge is as wide as the better of its elements, a way as its
+    narrower edge. Twice: elements differ by chance, by as many speckles as they hold.
+    """
+    ways, area = mesh.derive(_ways, active.tobytes()), mesh.areas * active
+    nodal = mesh.to_nodes(information * area) / np.maximum(mesh.to_nodes(area), 1e-300)
+    # the last element stands for a node itself
+    width = np.maximum.reduceat(np.append(information, np.inf)[ways.elements], ways.element_starts)
+    widest = np.maximum.reduceat(np.minimum(width[ways.first], width[ways.second]), ways.starts)
+    structure = ways.structure
+    row = np.repeat(np.arange(len(nodal)), np.diff(structure.indptr))
+    node, neighbour = nodal[row], nodal[structure.indices]
+    by_node = np.divide(neighbour, node + neighbour, out=np.full(row.size, 0.5), where=node + neighbour > 0)
+    by_way = np.divide(np.minimum(2 * widest, node), node, out=np.ones(row.size), where=node > 0)
+    return np.asarray(by_node * by_way**2)
 
 
 def slope_operators(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, sp.csr_matrix]:
@@ -232,8 +250,7 @@ def _window(mesh: Tri3Mesh, active: bytes) -> tuple[Index, Index, FloatArray, sp
     """
     elements = np.frombuffer(active, dtype=bool)
     surrounded = angle_fraction(mesh, elements)
-    is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
-    reach = _reached(mesh, elements, ~is_tip)
+    reach = mesh.derive(_ways, active).structure
     number = np.diff(reach.indptr)
     is_entry = np.arange(number.max()) < number[:, None]
     neighbours = np.repeat(np.arange(number.size)[:, None], is_entry.shape[1], axis=1)
@@ -287,17 +304,62 @@ def _basis(mesh: Tri3Mesh, active: bytes, offset: bytes | None) -> FloatArray:
     return basis
 
 
-def _reached(mesh: Tri3Mesh, active: BoolArray, passable: BoolArray) -> sp.csr_matrix:
-    """Return the nodes up to two edges of `active` elements away from each and itself, as the entries of its row.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Ways:
+    """Ways over one or two edges from each node to those around it.
 
-    A way leads through `passable` nodes (N,) only: not round the tip of a crack to its other side.
+    Attributes
+    ----------
+    structure : csr_matrix, shape (N, N)
+        The nodes that are reached from each, and itself; its indices are sorted.
+    elements, element_starts
+        Elements at each edge, and where those of an edge begin. A node is an edge to itself, of the element E.
+    first, second
+        Edges of each way.
+    starts
+        Where the ways of an entry of the structure begin.
     """
-    corners, itself = mesh.elements[active], np.arange(len(mesh.nodes))
-    rows = np.concatenate([np.repeat(corners, 3, axis=1).ravel(), itself])
-    columns = np.concatenate([np.tile(corners, 3).ravel(), itself])
-    beside = sp.csr_matrix((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(itself.size, itself.size))
-    row = np.repeat(itself, np.diff(beside.indptr))
-    through = with_data(beside, passable[row] | (beside.indices == row))
-    reached = sp.csr_matrix(beside @ through)
-    reached.sort_indices()  # or scipy might, later, in one of the matrices that share them
-    return reached
+
+    structure: sp.csr_matrix
+    elements: Index
+    element_starts: Index
+    first: Index
+    second: Index
+    starts: Index
+
+
+def _ways(mesh: Tri3Mesh, active: bytes) -> _Ways:
+    """Find the ways over `active` elements; they do not lead round the tip of a crack to its other side."""
+    is_active, count = np.frombuffer(active, dtype=bool), len(mesh.nodes)
+    is_tip = mesh.on_boundary & (angle_fraction(mesh, is_active) > 0.8)  # of a crack that opens by less than 70 degrees
+    corners, nodes = mesh.elements[is_active].astype(np.intp), np.arange(count)
+    sides = count * np.repeat(corners, 3, axis=1).ravel() + np.tile(corners, 3).ravel()
+    keys = np.concatenate([sides, (count + 1) * nodes])
+    elements = np.concatenate([np.repeat(np.flatnonzero(is_active), 9), np.full(count, len(mesh.elements))])
+    order = np.argsort(keys, kind="stable")
+    edges, element_starts = np.unique(keys[order], return_index=True)
+    begin, end = np.divmod(edges, count)
+    number = np.bincount(begin, minlength=count)
+    following = number[end]
+    first = np.repeat(np.arange(edges.size), following)
+    second = np.arange(first.size) + np.repeat(
+        (np.cumsum(number) - number)[end] - (np.cumsum(following) - following), following
+    )
+    allowed = ~is_tip[end[first]] | (end[second] == end[first])
+    first, second = first[allowed], second[allowed]
+    way_order = np.argsort(count * begin[first] + end[second], kind="stable")
+    first, second = first[way_order], second[way_order]
+    reached, starts = np.unique(count * begin[first] + end[second], return_index=True)
+    row, column = np.divmod(reached, count)
+    offsets = np.searchsorted(row, np.arange(count + 1))
+    structure = sp.csr_matrix(
+        (np.ones(reached.size), column.astype(np.int32), offsets.astype(np.int32)), shape=(count, count)
+    )
+    return _Ways(
+        structure=structure,
+        elements=elements[order],
+        element_starts=element_starts,
+        first=first,
+        second=second,
+        starts=starts,
+    )

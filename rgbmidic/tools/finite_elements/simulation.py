@@ -359,7 +359,7 @@ class Levelling:
         self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(is_covered, dtype=np.float64)) > 0)
         self._factors = splu(sp.csc_matrix(weighted @ shape + sp.diags(1.0 * ~self._covered)))
         self._moments = sp.csr_matrix(weighted @ sampling)
-        self._recovery = Recovery.over(mesh, is_covered, self._covered.astype(np.float64))
+        self._recovery = Recovery.over(mesh, is_covered)
 
     def __call__(self, displacement: FloatArray) -> FloatArray:
         """Return the displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN outside its mesh."""

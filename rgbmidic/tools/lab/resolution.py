@@ -57,7 +57,7 @@ def cut_offs(gauges: tuple[float, ...]) -> tuple[float, float, FloatArray]:
     count = int(np.ceil(max(lengths, default=0.0))) + 14  # half a gauge and the reach of the recovery on either side
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 8 * count, 8 * count), (8 * count + 1,) * 2), 8.0)
     fitted = splu(mesh.mass_matrix).solve(_integrals(mesh, 2 * np.pi / (8.0 * periods)))
-    recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)))
+    recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool))
     field = recovery.value @ fitted
     cut_offs_px = [
         _cut_off(mesh, periods, field, 3.0),

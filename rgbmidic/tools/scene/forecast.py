@@ -102,7 +102,7 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
         assemble(np.maximum(information, 1e-3 * USUAL.min_texture * np.median(density[is_visible])))
     )
     is_used = np.asarray(is_visible[mesh.elements].all(axis=1))
-    recovery = Recovery.over(mesh, is_used, density)
+    recovery = Recovery.over(mesh, is_used, information)
     along_x = [((recovery.value, None), is_visible)]
     std = np.stack([functional_std(solve, assemble(score), mesh, along_x)[:, 0] for score in scores])
     return np.where(is_visible & (std < USUAL.max_std), std, np.nan)

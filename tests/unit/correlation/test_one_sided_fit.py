@@ -18,7 +18,7 @@ Y, X = np.mgrid[:200, :200]
 INSIDE = (np.abs(X - 100) < 90) & (np.abs(Y - 100) < 90)
 MESH = Tri3Mesh.from_region(Region.from_mask(INSIDE & (np.hypot(X - 100, Y - 100) > 30)), 16)
 USED, COUNT = np.ones(len(MESH.elements), dtype=bool), len(MESH.nodes)
-RECOVERY = Recovery.over(MESH, USED, np.ones(COUNT))
+RECOVERY = Recovery.over(MESH, USED)
 OPERATORS = RECOVERY.value, RECOVERY.slope_x, RECOVERY.slope_y
 EDGE = at_free_boundary(MESH)
 NEAR = EDGE | MESH.adjacent_nodes(EDGE)

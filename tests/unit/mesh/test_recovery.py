@@ -9,7 +9,7 @@ import pytest
 
 from rgbmidic.fields import at_pixels
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.recovery import Recovery
+from rgbmidic.mesh.recovery import Recovery, _relative_information, _ways
 
 SIZE = 10.0
 GAIN = {3: (0.90, 1.03), 4: (0.97, 1.03), 6: (0.99, 1.02)}
@@ -36,7 +36,7 @@ def meshed(kind: str) -> tuple[Tri3Mesh, PixelMap]:
 
 
 def everywhere(mesh):
-    return Recovery.over(mesh, np.ones(len(mesh.elements), dtype=bool), np.ones(len(mesh.nodes)))
+    return Recovery.over(mesh, np.ones(len(mesh.elements), dtype=bool))
 
 
 def linear_fit(mesh, field):
@@ -118,7 +118,7 @@ def test_nothing_passes_over_elements_that_are_not_used():
     mesh, _ = meshed("rectangle")
     centre = mesh.nodes[mesh.elements].mean(axis=1)[:, 0]
     used = np.abs(centre - 100) > SIZE
-    recovery = Recovery.over(mesh, used, np.ones(len(mesh.nodes)))
+    recovery = Recovery.over(mesh, used)
     left = mesh.nodes[:, 0] < 100 - SIZE / 2
     field = np.where(left, 0.01 * mesh.nodes[:, 1], 3.0)
     np.testing.assert_allclose((recovery.value @ field)[left], field[left], atol=1e-6)
@@ -129,9 +129,44 @@ def test_nothing_passes_over_elements_that_are_not_used():
 def test_a_node_that_is_known_badly_hardly_counts_elsewhere():
     mesh, _ = meshed("rectangle")
     middle = int(np.argmin(np.hypot(*(mesh.nodes - 100).T)))
-    information = np.ones(len(mesh.nodes))
-    information[middle] = 1e-3
+    information = np.where((mesh.elements == middle).any(axis=1), 1e-3, 1.0)
     recovery = Recovery.over(mesh, mesh.areas > 0, information)
     others = np.delete(recovery.value.toarray()[:, middle], middle)
     plain = np.delete(everywhere(mesh).value.toarray()[:, middle], middle)
     assert np.abs(others).max() < 0.01 * np.abs(plain).max()
+
+
+def test_a_step_in_elements_that_show_little_stays_in_them():
+    mesh, _ = meshed("rectangle")
+    centre = mesh.nodes[mesh.elements].mean(axis=1)[:, 0]
+    step = np.abs(centre - 100) <= SIZE
+    recovery = Recovery.over(mesh, mesh.areas > 0, np.where(step, 0.02, 1.0))
+    field = np.where(mesh.nodes[:, 0] < 100, -1.0, 1.0)
+    hidden = recovery.value @ field - field
+    shown = everywhere(mesh).value @ field - field
+    known = ~np.isin(np.arange(len(field)), mesh.elements[step]) | (np.abs(mesh.nodes[:, 0] - 100) >= SIZE / 2)
+    assert np.abs(hidden[known]).max() < 0.05 * np.abs(shown).max()
+
+
+def test_nodes_are_reached_over_the_widest_way():
+    mesh, _ = meshed("rectangle")
+    random = np.random.default_rng(0)
+    active = random.uniform(size=len(mesh.elements)) > 0.2
+    information = random.uniform(0.01, 1, active.size)
+    edges = dict[tuple[int, int], float]()
+    for corners, value in zip(mesh.elements[active], information[active], strict=True):
+        for a in map(int, corners):
+            for b in map(int, corners):
+                edges[a, b] = max(edges.get((a, b), 0), value) if a != b else np.inf
+    area = mesh.areas * active
+    nodal = mesh.to_nodes(information * area) / np.maximum(mesh.to_nodes(area), 1e-300)
+    structure = _ways(mesh, active.tobytes()).structure
+    factors = _relative_information(mesh, active, information)
+    row = np.repeat(np.arange(len(nodal)), np.diff(structure.indptr))
+    for node, neighbour, factor in [*zip(row, structure.indices, factors, strict=True)][::7]:
+        beside = {b for a, b in edges if a == node}
+        way = max((min(edges[node, k], edges.get((k, neighbour), 0)) for k in beside), default=np.inf)
+        expected = 0.5
+        if nodal[node] > 0:
+            expected = nodal[neighbour] / (nodal[node] + nodal[neighbour]) * min(1, 2 * way / nodal[node]) ** 2
+        assert factor == pytest.approx(expected)

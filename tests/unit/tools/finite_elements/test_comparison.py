@@ -152,7 +152,7 @@ def test_a_linear_field_is_levelled_to_itself_and_one_of_the_mesh_to_its_recover
     assert found.T[reached] == pytest.approx((np.c_[MESH.nodes, np.ones(NODES)] @ expected)[reached], abs=1e-6)
     field = random.normal(size=(NODES, 2))
     everywhere = np.ones(len(MESH.elements), dtype=bool)
-    recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
+    recovery = Recovery.over(MESH, everywhere)
     assert pytest.approx(recovery.value @ field, abs=1e-9) == Levelling(MESH, MESH)(field).T
 
 
@@ -169,7 +169,7 @@ def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
     hats = np.stack([LinearTriInterpolator(coarse, one)(*points.T).filled(0) for one in np.eye(NODES)], axis=1)
     fitted = np.linalg.solve(hats.T @ hats, hats.T @ seen)
     everywhere = np.ones(len(MESH.elements), dtype=bool)
-    recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
+    recovery = Recovery.over(MESH, everywhere)
     off = Levelling(MESH, fine)(wave).T - recovery.value @ fitted
     assert np.sqrt(np.mean(off**2)) < 0.004  # of an amplitude of 1: the quadrature's error
 

@@ -130,8 +130,7 @@ def test_the_spatial_resolution_is_that_of_a_wave_measured_on_the_mesh():
             np.add.at(normal, (nodes[:, a], nodes[:, b]), shape[:, a] * shape[:, b])
     from rgbmidic.mesh.recovery import Recovery
 
-    every = np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes))
-    recovered = Recovery.over(mesh, *every).value @ np.linalg.solve(normal, right)
+    recovered = Recovery.over(mesh, np.ones(len(mesh.elements), bool)).value @ np.linalg.solve(normal, right)
     inner = ((mesh.nodes > 3.5 * side) & (mesh.nodes < 12.5 * side)).all(axis=1)
     true = np.cos(2 * np.pi * mesh.nodes[inner, 0] / period)
     assert (recovered[inner] @ true) / (true @ true) == pytest.approx(0.9, abs=0.03)

@@ -44,7 +44,7 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
     region = Region.from_rectangle((0, 0, 160, 160), shape)
     mesh = Tri3Mesh.from_region(region, size)
     pixels = PixelMap.from_mesh(mesh, region)
-    recovery = Recovery.over(mesh, mesh.areas > 0, np.ones(len(mesh.nodes)))
+    recovery = Recovery.over(mesh, mesh.areas > 0)
     noise = np.random.default_rng(0).normal(size=(400, pixels.rows.size)).astype(np.float32)
     parts, loads = np.zeros((1, len(mesh.elements), 3, 2)), []
     for first, second in noise.reshape(-1, 2, pixels.rows.size):
