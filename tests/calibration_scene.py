@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from textures import sum_of_cosines
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 
@@ -72,9 +73,7 @@ def wave_texture(x, y, rng, size=4.2, count=160):
     """A speckle that is known between the pixels too: a sum of waves at points x, y (px), albedo 0.1 to 0.8."""
     wave_x, wave_y = rng.normal(0, 1 / (0.9 * size), (2, count))
     phase = rng.uniform(0, 2 * np.pi, count)
-    total = np.zeros_like(x)
-    for kx, ky, start in zip(wave_x, wave_y, phase, strict=True):
-        total += np.cos(kx * x + ky * y + start)
+    total = sum_of_cosines(x, y, np.stack([wave_x, wave_y], axis=1), phase)
     return 0.1 + 0.7 / (1 + np.exp(-3 * total / np.sqrt(count / 2)))
 
 

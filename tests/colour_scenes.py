@@ -1,5 +1,7 @@
 """Quick synthetic colour frames for the demosaicing tests: exact texture, reflections as channel-specific sparkle."""
 
+from functools import cache
+
 import numpy as np
 from naive_demosaic import colour_by_colour
 from scipy.ndimage import gaussian_filter
@@ -15,6 +17,7 @@ FULL_SCALE = 4031.0
 NOISE = NoiseModel(gain=4.0, read_noise=3.0)
 
 
+@cache
 def speckle(shape, *, diameter=4.2, seed=0, blur=0.5):
     """Dark discs on white, covering about half, drawn 4 times finer and averaged: values about 0.1 to 0.8."""
     rng, fine = np.random.default_rng(seed), 4
@@ -30,7 +33,9 @@ def speckle(shape, *, diameter=4.2, seed=0, blur=0.5):
         inside = ((i - y) ** 2 + (j - x) ** 2 < radius**2) & (i >= 0) & (j >= 0) & (i < height) & (j < width)
         canvas[i[inside], j[inside]] = 0.1
     canvas = gaussian_filter(canvas, blur * fine)
-    return canvas.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+    image = canvas.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+    image.flags.writeable = False  # it is that of every other caller, too
+    return image
 
 
 def sparkle(shape, strength, seed):

@@ -56,16 +56,7 @@ class Texture:
 
     def at(self, x: Array, y: Array) -> Array:
         """Grey levels at any points, for motions that are not affine."""
-        x, y = np.broadcast_arrays(x, y)
-        if x.ndim == 2 and (x == x[:1]).all() and (y == y[:, :1]).all():
-            return self._levels(_on_grid(x[0], y[:, 0], self.waves, self.phases))
-        points, turns = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]), np.c_[self.waves, self.phases] / (2 * np.pi)
-        total = np.empty(x.size)
-        for first in range(0, x.size, _CHUNK):
-            angles = points[:, first : first + _CHUNK].T @ turns.T
-            angles -= np.rint(angles)  # within half a turn single precision errs by 1e-6 of the contrast
-            total[first : first + _CHUNK] = np.cos((2 * np.pi * angles).astype(np.float32)).sum(axis=1)
-        return self._levels(total.reshape(x.shape))
+        return self._levels(sum_of_cosines(x, y, self.waves, self.phases))
 
     def image(self, shape: tuple[int, int], motion: Affine | None = None) -> Array:
         """Grey levels (H, W) at the pixel centres once every material point has moved."""
@@ -79,6 +70,20 @@ class Texture:
     def _levels(self, total: Array) -> Array:
         """Grey levels of a sum of cosines."""
         return np.asarray(self.mean + self.contrast * np.sqrt(2 / len(self.waves)) * total)
+
+
+def sum_of_cosines(x: Array, y: Array, waves: Array, phases: Array) -> Array:
+    """The sum of plane waves (N, 2), of phases (N,), at any points x and y."""
+    x, y = np.broadcast_arrays(x, y)
+    if x.ndim == 2 and (x == x[:1]).all() and (y == y[:, :1]).all():
+        return _on_grid(x[0], y[:, 0], waves, phases)
+    points, turns = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]), np.c_[waves, phases] / (2 * np.pi)
+    total = np.empty(x.size)
+    for first in range(0, x.size, _CHUNK):
+        angles = points[:, first : first + _CHUNK].T @ turns.T
+        angles -= np.rint(angles)  # within half a turn single precision errs by 1e-6 of the contrast
+        total[first : first + _CHUNK] = np.cos((2 * np.pi * angles).astype(np.float32)).sum(axis=1)
+    return total.reshape(x.shape)
 
 
 def _on_grid(x: Array, y: Array, waves: Array, phases: Array) -> Array:
