@@ -281,7 +281,7 @@ class Estimate:
     longest : float
         Largest of a textured node, or by a light's rigid motion, px.
     ratio : float
-        Of it to that before with the same equations; with others as before, and at most a tenth: it ends at .01 to .06.
+        Of it to that before with the same equations; of the first one .1, more than it is at the end (.01 to .06).
     relaxation : float
         Fraction of a step that the next iteration takes.
     """
@@ -306,12 +306,12 @@ class Estimate:
         return self.remainder * self.longest
 
     def has_settled(self, motion: float) -> bool:
-        """Return True if a fifth of a `motion` (px) is left, or what most of the nodes move by falls no more.
+        """Return True if a quarter of a `motion` (px) is left, or what most of the nodes move by falls no more.
 
         Nodes that wander where nothing matches, a tenth of them, do not keep the others waiting.
         """
         if self.remainder < 1 or self.equations is None:
-            return self.remaining <= motion / 5
+            return self.remaining <= motion / 4
         before, last = np.quantile(np.stack(self.increments[-5:])[[0, -1]][:, self.equations.textured], 0.9, axis=1)
         return bool(last <= motion or (len(self.increments) > 4 and last > before / 2))
 
@@ -366,7 +366,7 @@ def gauss_newton_step(problem: Problem, equations: Equations, residual: Residual
     if not np.isfinite(longest):
         raise UnsolvableError("the iteration diverged", estimate)
     motion *= np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
-    ratio = min(estimate.ratio, 0.1) if is_first else longest / max(estimate.longest, 1e-30)
+    ratio = 0.1 if is_first else longest / max(estimate.longest, 1e-30)
     # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken):
     # from half of a step that the next one takes back each halves the error no longer
     swing = 0.0 if is_first else float((motion * estimate.motion).sum() / max((estimate.motion**2).sum(), 1e-30))

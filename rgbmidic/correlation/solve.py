@@ -139,7 +139,7 @@ def _held_elements(
 
     A one-sided texture does not hold a node either, but matches.
     """
-    if matched.all() and estimate.remaining <= problem.constants.reweight_motion / 5:
+    if matched.all() and estimate.remaining <= problem.constants.reweight_motion / 4:
         return matched
     std = standard_uncertainty(BlockTable.of(residual, equations.weights), equations, last.precision)
     lost = (std.max(axis=1) > problem.constants.max_std) & ~one_sided_texture(equations, residual)
@@ -216,19 +216,19 @@ def solve(
 
 
 def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> Solution:
-    tolerance = problem.options.tolerance
     estimate, weighting = _refine_initial_guess(problem, estimate, residual)
-    equations, are_final = assemble(problem, weighting, estimate), False
+    equations, is_weighed = assemble(problem, weighting, estimate), False
     for _ in range(problem.options.max_iterations):
         estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
-        if are_final and estimate.remaining <= tolerance / 5:
+        if is_weighed and estimate.remaining <= problem.options.tolerance / 10:
             break
-        if estimate.has_settled(problem.constants.reweight_motion):
+        is_weighed = estimate.has_settled(problem.constants.reweight_motion)
+        if is_weighed:
             weighting = weigh(problem, weighting, equations, estimate)
-            are_final = weighting.has_converged(equations)
-            equations = equations if are_final else assemble(problem, weighting, estimate)
+            if not weighting.has_converged(equations):
+                equations = assemble(problem, weighting, estimate)
         else:
-            weighting, are_final = follow(problem, weighting, estimate), False
+            weighting = follow(problem, weighting, estimate)
     return conclude(problem, estimate, equations, weighting)
 
 

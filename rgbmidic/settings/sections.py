@@ -355,7 +355,7 @@ class SolverSettings(CheckedSettings):
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
     tolerance
-        The iteration stops when a fifth of this (px) is left of the motion of any node, as the last two steps have it.
+        The iteration stops when a tenth of this (px) is left of the motion of any node, as the last two steps have it.
     max_iterations
         Iterations before the frame counts as not converged.
 

@@ -33,6 +33,15 @@ def test_plain_arrays_give_a_mesh_a_field_and_its_uncertainty(pair):
     np.testing.assert_allclose(found.displacement[inner], np.broadcast_to(SHIFT, (inner.sum(), 2)), atol=7e-4)
 
 
+@pytest.mark.parametrize(("shift", "most"), [((0.0, 0.0), 3), ((0.3, -0.2), 5)])
+def test_few_iterations_are_taken(shift, most):
+    """Of images without noise; at rest the last row lies on the image's edge or just beyond it, as rounding has it."""
+    texture = Texture.random(0)
+    found = correlate(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=shift)), initial=(0.0, 0.0))
+    assert found.iterations <= most
+    assert np.nanmedian(np.abs(found.displacement - shift)) < 5e-4  # what splines of this speckle err by
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
 def test_any_real_number_type_is_taken(pair, dtype):
     images = [np.round(image / 2).clip(0, 255).astype(dtype) for image in pair]
