@@ -116,7 +116,11 @@ def weigh(problem: Problem, last: Weighting, equations: Equations, estimate: Est
     precision = None if problem.method is None else problem.method.precision(minimised)
     matched = matching_elements(residual, displacement, precision)
     matched = _held_elements(problem, last, equations, estimate, residual, matched)
-    weighting = Weighting(residual=residual, matched=matched, precision=precision, learnt_at=displacement)
+    weighting = Weighting(residual=residual, matched=matched, learnt_at=displacement)
+    if problem.method is not None and not matched.all():
+        # the residual of elements that match nothing would count in the variance around them
+        precision = problem.method.precision(replace(minimised, weights=weighting.prior_weights()))
+    weighting = replace(weighting, precision=precision)
     adapted = with_consistent_gradient(residual, weighting.weights())
     if adapted.brightness != "auto" or residual.smooth_fraction <= constants.max_smooth_fraction:
         return replace(weighting, residual=replace(residual, reference=adapted))

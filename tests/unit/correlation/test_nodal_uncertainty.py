@@ -180,8 +180,10 @@ def test_a_crack_leaves_intact_material_as_certain_as_before():
     stays = ((place >= 0) & (place <= 299)).all(axis=1)
     intact = (apart > 60) & found.measured
     np.testing.assert_array_equal(intact, (apart > 60) & stays)
-    assert (~found.measured[apart < 13]).mean() > 0.62
-    ratio = (found.displacement - true)[intact] / found.displacement_std[intact]
+    ratio = (found.displacement - true) / found.displacement_std
+    # at the crack nodes are lost, or hold to the side that they lie on
+    assert (np.abs(ratio)[(apart < 13) & found.measured] < 4.5).all()
+    ratio = ratio[intact]
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3
     assert np.median(found.displacement_std[intact]) < 1.3 * np.nanmedian(whole.displacement_std)
 
