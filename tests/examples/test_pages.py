@@ -229,7 +229,9 @@ def blank_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(Figure((1, 1)), *to, **how))
         patch.setattr(report, "write_figures", lambda *_, **__: [])
-        patch.setattr(report, "FieldMovie", lambda **shown: movie(**shown | {"frames": shown["frames"][:2]}))
+        patch.setattr(
+            report, "FieldMovie", lambda **shown: movie(**shown | {"frames": (shown["frames"] or [0, 1])[:2]})
+        )
         for maps in ("fields", "strip"):
             patch.setattr(report.MapDrawer, maps, lambda *_, **__: Figure((1, 1)))
         yield
