@@ -125,12 +125,8 @@ def compared(
         weights = (sp.kron(sp.eye(len(points)), factors, format="csr") @ at).toarray()
         exact = np.stack([at_nodes(frame, points.reshape(-1, 2)) for frame in truth])
         exact = np.einsum("tspc,p->tcs", exact.reshape(len(truth), *points.shape), factors)
-        assert displacement.bias is not None
         variance = [
-            [
-                covariance.variance(weights, *noise)
-                for noise in zip(one.uncertainty[:, None], one.bias[:, None], strict=True)
-            ]
+            [covariance.variance(weights, one.isel(frame=index)) for index in range(len(truth))]
             for one in displacement.components
         ]
         return moved @ weights.T - exact, np.sqrt(variance).swapaxes(0, 1), exact

@@ -93,6 +93,10 @@ def test_the_stated_uncertainty_of_a_graded_mesh_is_observed() -> None:
     assert RATIO[0] < np.median(ratio) < RATIO[1]
 
 
+RMS = 1.5e-3
+"""Largest rms error, px: 1.04e-3 (2026-11-29)."""
+
+
 def place(nodes: FloatArray) -> FloatArray:
     """Millimetres in the mesh's axes, y up."""
     return (nodes - MIDDLE) * [0.1, -0.1] + [50, 20]
@@ -126,7 +130,9 @@ def result(test_file: Path) -> Result:
 def test_a_test_is_measured_on_the_mesh_of_a_file(result: Result) -> None:
     assert result.nodes == pytest.approx(MESH.nodes, abs=1e-6)
     assert (result.status == 0).all()
-    assert result.u[1] == pytest.approx(0.4, abs=6e-3)
+    error = result.u[1] - 0.4  # by rounding to grey levels
+    assert np.sqrt((error**2).mean()) < RMS
+    assert (np.abs(error) < 4 * result.u_std[1]).all()
     assert result.node_mm == pytest.approx(place(MESH.nodes))
     placement = placement_of(result)
     assert placement is not None

@@ -196,7 +196,9 @@ def measure_stereo(
         check_file(file, overwrite=run.get("overwrite", False) or run.get("resume", False))
         with suppress(ResultError):  # of another version: it is triangulated again
             if run.get("resume", False) and StereoResult.open(file).attributes["calibration"] != calibration:
-                raise InputError(f"{file} is of other cameras than {pair.name}: choose another name, or --overwrite it")
+                raise InputError(
+                    f"{file} is of other cameras than {pair.name}; choose another name (`overwrite=True` replaces it)"
+                )
     first, second, shape = _measure_cameras((left, right), pair, out, settings, run)
     meshes = shape.carried_mesh
     attributes = {
