@@ -139,11 +139,12 @@ def _held_elements(
     residual: Residual,
     matched: BoolArray,
 ) -> BoolArray:
-    """Return the matched elements (E,) less those with a node that the images do not hold, where some may have none.
+    """Return the matched elements (E,) less those with a node that the images do not hold.
 
-    A one-sided texture does not hold a node either, but matches.
+    As long as these are the last ones and the nodes stay there is none but those that are out already. A one-sided
+    texture does not hold a node either, but matches.
     """
-    if matched.all() and estimate.remaining <= problem.constants.reweight_motion / 4:
+    if estimate.remaining <= problem.constants.reweight_motion / 4 and np.array_equal(matched, last.matched):
         return matched
     std = standard_uncertainty(BlockTable.of(residual, equations.weights), equations, last.precision)
     lost = (std.max(axis=1) > problem.constants.max_std) & ~one_sided_texture(equations, residual)
@@ -224,7 +225,7 @@ def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> S
     equations, is_weighed = assemble(problem, weighting, estimate), False
     for _ in range(problem.options.max_iterations):
         estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
-        if is_weighed and estimate.remaining <= problem.options.tolerance / 10:
+        if is_weighed and estimate.has_converged(problem.options.tolerance):
             break
         is_weighed = estimate.has_settled(problem.constants.reweight_motion)
         if is_weighed:
