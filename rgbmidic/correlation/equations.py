@@ -306,7 +306,7 @@ class Estimate:
         return self.remainder * self.longest
 
     def has_converged(self, tolerance: float) -> bool:
-        """Return True if a tenth of the `tolerance` (px) is left, or the last of steps that do not halve is below it."""
+        """Return True if a tenth of the `tolerance` (px) is left, or a step that does not halve is below it."""
         return self.remaining <= tolerance / 10 or (self.remainder == 1 and self.longest <= tolerance)
 
     def has_settled(self, motion: float) -> bool:
