@@ -305,10 +305,6 @@ class Estimate:
         """Largest motion that is left, px."""
         return self.remainder * self.longest
 
-    def has_converged(self, tolerance: float) -> bool:
-        """Return True if a tenth of the `tolerance` (px) is left, or a step that does not halve is below it."""
-        return self.remaining <= tolerance / 10 or (self.remainder == 1 and self.longest <= tolerance)
-
     def has_settled(self, motion: float) -> bool:
         """Return True if a quarter of a `motion` (px) is left, or what most of the nodes move by falls no more.
 

@@ -225,7 +225,7 @@ def _solve(problem: Problem, estimate: Estimate, residual: Residual | None) -> S
     equations, is_weighed = assemble(problem, weighting, estimate), False
     for _ in range(problem.options.max_iterations):
         estimate = gauss_newton_step(problem, equations, weighting.residual, estimate)
-        if is_weighed and estimate.has_converged(problem.options.tolerance):
+        if is_weighed and estimate.remaining <= problem.options.tolerance / 10:
             break
         is_weighed = estimate.has_settled(problem.constants.reweight_motion)
         if is_weighed:
